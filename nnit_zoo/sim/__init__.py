@@ -1,0 +1,1 @@
+"""Simulation on a CPU: many SAPIEN scenes stepped in lockstep, each built afresh for its episode."""
