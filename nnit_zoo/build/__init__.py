@@ -1,0 +1,1 @@
+"""Building a zoo: expert, GHNs distilled from it, selection by scores, packing."""

@@ -1,0 +1,198 @@
+"""From expert to GHNs: DAgger gathers a buffer of states once, then every seed's GHN regresses onto the expert there.
+
+NNiT appendix C distils each GHN with DAgger of its own; a shared buffer costs a sixth of that on a CPU
+(docs/deviations.md), and every zoo's record says that it was used.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict
+from safetensors.numpy import load_file as load_arrays
+from safetensors.numpy import save_file as save_arrays
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from nnit_zoo.architecture import Architecture, architectures
+from nnit_zoo.build import expert as experts
+from nnit_zoo.build.files import write_atomically
+from nnit_zoo.build.ghn import GHN
+from nnit_zoo.sim.control import Controller
+from nnit_zoo.sim.rollout import rollout
+from nnit_zoo.sim.tabletop import Array
+from nnit_zoo.tasks.robot import RobotPolicyTask
+
+COLLECTION_SEEDS = 200_000_000  # episode seeds of DAgger count up from here
+COLLECTOR = 1_000_000  # seed of the GHN that gathers the buffer; it is in no zoo
+
+
+class DistillConfig(BaseModel):
+    """Settings of the buffer's DAgger rounds and of each GHN's regression."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rounds: int = 10
+    episodes_per_round: int = 750
+    teacher_decay: float = 0.6
+    action_noise: float = 0.4
+    round_steps: int = 250
+    round_learning_rate: float = 2e-3
+    steps: int = 1500
+    learning_rate: float = 3e-3
+    architectures_per_step: int = 8
+    states_per_architecture: int = 256
+    weight_noise: float = 0.05
+
+
+class Regression:
+    """Fits a GHN, on architectures drawn at random from the seen ones, to labelled states.
+
+    Each block gets Gaussian noise of `weight_noise` times its root mean square: policies then survive weight errors of
+    a few per cent, without which no generated policy works.
+    """
+
+    def __init__(self, ghn: GHN, config: DistillConfig, seed: int) -> None:
+        self.ghn, self.config = ghn, config
+        self.seen = architectures("seen", ghn.inputs, ghn.outputs)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def run(self, states: Tensor, labels: Tensor, steps: int, optimizer: Any, schedule: Any = None) -> float:
+        """Take steps on standardised states [s, inputs] and labels [s, outputs]; returns the last losses' mean."""
+        config, draw = self.config, self.generator
+        recent: list[float] = []
+        for _ in range(steps):
+            chosen = torch.randperm(len(self.seen), generator=draw)[: config.architectures_per_step].tolist()
+            networks = self.ghn([self.seen[index] for index in chosen])
+            loss = torch.zeros(())
+            for blocks in networks:
+                rows = torch.randint(len(states), (config.states_per_architecture,), generator=draw)
+                loss = loss + nn.functional.mse_loss(self._noisy_forward(blocks, states[rows]), labels[rows])
+            optimizer.zero_grad()
+            (loss / len(networks)).backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(self.ghn.parameters(), 1.0)
+            optimizer.step()
+            if schedule:
+                schedule.step()
+            recent = [*recent[-49:], float(loss.detach()) / len(networks)]
+        return sum(recent) / len(recent)
+
+    def _noisy_forward(self, blocks: Sequence[Tensor], states: Tensor) -> Tensor:
+        hidden = states
+        for level, block in enumerate(blocks):
+            scale = self.config.weight_noise * block.detach().square().mean().sqrt()
+            noisy = block + scale * torch.randn(block.shape, generator=self.generator)
+            hidden = nn.functional.linear(hidden, noisy[:, :-1], noisy[:, -1])
+            if level < len(blocks) - 1:
+                hidden = hidden.tanh()
+        return hidden
+
+
+def standardise(task: RobotPolicyTask, observations: Array) -> Array:
+    """Standardised observations [n, inputs], as every policy sees them."""
+    return np.asarray((observations - task.observation_mean) / task.observation_std)
+
+
+def collect(
+    task: RobotPolicyTask,
+    network: experts.Network,
+    students: Sequence[Sequence[Array]],
+    seeds: range,
+    beta: float,
+    noise: float,
+) -> Array:
+    """Raw observations [len(seeds) * steps, inputs] of episodes in which the teacher acts with probability `beta`.
+
+    Student i acts in episode i. The teacher's actions get Gaussian noise, of a scale drawn per episode up to `noise`.
+    """  # fmt: skip
+    generator = np.random.default_rng(seeds.start)
+    scales = generator.uniform(0, noise, (len(seeds), 1)).astype(np.float32)
+    controller = Controller(students, task.observation_mean, task.observation_std) if students else None
+
+    def act(observations: Array) -> Array:
+        actions = np.clip(experts.mean_action(network, observations), -1, 1)
+        actions += scales * generator.standard_normal(actions.shape, np.float32)
+        if controller is None:
+            return actions
+        teacher = generator.random((len(seeds), 1)) < beta
+        return np.where(teacher, actions, controller(observations))
+
+    return rollout(task, seeds, act).observations[:-1].reshape(-1, task.inputs)
+
+
+def gather_states(
+    task: RobotPolicyTask,
+    config: DistillConfig,
+    network: experts.Network,
+    folder: Path,
+    workers: int,
+    log: Callable[[str], None],
+) -> None:
+    """Make `folder`/states.safetensors, raw observations [s, inputs], with a file per DAgger round on the way."""
+    from joblib import Parallel, delayed  # noqa: PLC0415  part of the simulator's extra
+
+    ghn = GHN(task.inputs, task.outputs, COLLECTOR)
+    regression = Regression(ghn, config, COLLECTOR)
+    optimizer = torch.optim.AdamW(ghn.parameters(), lr=config.round_learning_rate)
+    gathered: list[Array] = []
+    with Parallel(n_jobs=workers) as pool:
+        for round_ in range(config.rounds):
+            first = COLLECTION_SEEDS + round_ * config.episodes_per_round
+            seeds = range(first, first + config.episodes_per_round)
+            chunks = [seeds[start : start + 50] for start in range(0, len(seeds), 50)]
+            students = [_students(ghn, regression, len(chunk)) if round_ else [] for chunk in chunks]
+            path = folder / f"round-{round_}.safetensors"
+            if not path.exists():
+                beta = config.teacher_decay**round_
+                jobs = [
+                    delayed(collect)(task, network, *chunk, beta, config.action_noise)
+                    for chunk in zip(students, chunks, strict=True)
+                ]
+                _save_states(path, np.concatenate(pool(jobs)))
+            gathered.append(load_arrays(path)["states"])
+            inputs, labels = labelled(task, network, np.concatenate(gathered))
+            loss = regression.run(inputs, labels, config.round_steps, optimizer)
+            log(f"states: round {round_ + 1} of {config.rounds}, {len(inputs):,} states, loss {loss:.4f}")
+    _save_states(folder / "states.safetensors", np.concatenate(gathered))
+
+
+def _save_states(path: Path, states: Array) -> None:
+    write_atomically(path, lambda temporary: save_arrays({"states": states}, temporary))
+
+
+def _students(ghn: GHN, regression: Regression, count: int) -> list[list[Array]]:
+    """The GHN's policies of `count` seen architectures drawn at random, as arrays."""
+    chosen = torch.randint(len(regression.seen), (count,), generator=regression.generator).tolist()
+    cache: dict[Architecture, list[Array]] = {}
+    for index in chosen:
+        architecture = regression.seen[index]
+        if architecture not in cache:
+            cache[architecture] = [layer[0].numpy() for layer in ghn.emit(architecture).layers]
+    return [cache[regression.seen[index]] for index in chosen]
+
+
+def labelled(task: RobotPolicyTask, network: experts.Network, observations: Array) -> tuple[Tensor, Tensor]:
+    """Standardised states and the expert's clipped mean actions for raw observations."""
+    labels = np.clip(experts.mean_action(network, observations), -1, 1).astype(np.float32)
+    return torch.from_numpy(standardise(task, observations)), torch.from_numpy(labels)
+
+
+def train_ghn(
+    task: RobotPolicyTask, config: DistillConfig, network: experts.Network, states: Path, target: Path, seed: int
+) -> str:
+    """Train one seed's GHN on the buffer and store its state as float16 safetensors; returns a log line."""
+    torch.set_num_threads(1)
+    inputs, labels = labelled(task, network, load_arrays(states)["states"])
+    ghn = GHN(task.inputs, task.outputs, seed)
+    optimizer = torch.optim.AdamW(ghn.parameters(), lr=config.learning_rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=config.steps)
+    loss = Regression(ghn, config, seed).run(inputs, labels, config.steps, optimizer, schedule)
+    state = {name: tensor.half() for name, tensor in ghn.state_dict().items()}
+    note = {"seed": str(seed), "loss": json.dumps(loss)}
+    write_atomically(target, lambda temporary: save_file(state, temporary, note))
+    return f"GHN {seed}: loss {loss:.4f}"

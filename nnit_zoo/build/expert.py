@@ -1,0 +1,276 @@
+"""The expert: PPO on a CPU, 3 x 256 Tanh, whose mean action the GHNs are distilled from (NNiT appendix C)."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from nnit_zoo.build.files import write_atomically
+from nnit_zoo.sim.rollout import Episodes, rollout
+from nnit_zoo.sim.tabletop import Array
+from nnit_zoo.tasks.robot import RobotPolicyTask
+
+TRAINING_SEEDS = 100_000_000  # episode seeds of training count up from here
+EVALUATION_SEEDS = range(90_000_000, 90_000_200)
+
+Network = list[tuple[Array, Array]]  # (weight [out, in], bias [out]) of each layer
+
+
+class ExpertConfig(BaseModel):
+    """PPO's settings; ManiSkill's baseline with fewer environments and a longer horizon (gamma 0.9 for its 0.8)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seed: int = 0
+    total_steps: int = 4_000_000
+    environments: int = 64
+    hidden: int = 256
+    log_std: float = -0.5
+    learning_rate: float = 3e-4
+    gamma: float = 0.9
+    gae_lambda: float = 0.9
+    epochs: int = 6
+    minibatch: int = 400
+    clip: float = 0.2
+    value_weight: float = 0.5
+    target_kl: float = 0.1
+    max_grad_norm: float = 0.5
+    evaluate_every: int = 40
+    stop_success: float = 0.99
+    stop_return: float = 39.0
+
+
+class ActorCritic(nn.Module):
+    """Separate 3-layer Tanh networks for the mean action and the value, and one log standard deviation per action."""
+
+    def __init__(self, inputs: int, outputs: int, hidden: int, log_std: float) -> None:
+        super().__init__()
+        self.actor = _mlp(inputs, hidden, outputs, last_gain=0.01 * 2**0.5)
+        self.critic = _mlp(inputs, hidden, 1, last_gain=1.0)
+        self.log_std = nn.Parameter(torch.full((outputs,), log_std))
+
+    def log_prob(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Log density [b] of actions [b, outputs]."""
+        deviations = (actions - self.actor(observations)) / self.log_std.exp()
+        negative: Tensor = 0.5 * deviations.square() + self.log_std + 0.5 * math.log(2 * math.pi)
+        return -negative.sum(1)
+
+
+def _mlp(inputs: int, hidden: int, outputs: int, last_gain: float) -> nn.Sequential:
+    widths = (inputs, hidden, hidden, hidden, outputs)
+    modules: list[nn.Module] = []
+    for level, (into, out) in enumerate(pairwise(widths)):
+        linear = nn.Linear(into, out)
+        nn.init.orthogonal_(linear.weight, last_gain if level == 3 else 2**0.5)
+        nn.init.zeros_(linear.bias)
+        modules += [linear, nn.Tanh()]
+    return nn.Sequential(*modules[:-1])
+
+
+def network_of(actor: nn.Sequential) -> Network:
+    """The actor's layers as arrays, for use without torch in the simulator's processes."""
+    linears = [module for module in actor if isinstance(module, nn.Linear)]
+    return [(linear.weight.detach().numpy().copy(), linear.bias.detach().numpy().copy()) for linear in linears]
+
+
+def mean_action(network: Network, observations: Array) -> Array:
+    """The expert's mean actions [n, outputs], not clipped, on raw observations [n, inputs]."""
+    hidden = observations
+    for weight, bias in network[:-1]:
+        hidden = np.tanh(hidden @ weight.T + bias)
+    weight, bias = network[-1]
+    return np.asarray(hidden @ weight.T + bias)
+
+
+def load(path: Path) -> Network:
+    """The expert stored as safetensors with tensors `0.weight`, `0.bias`, `1.weight` and so on."""
+    tensors = load_file(path)
+    return [
+        (tensors[f"{level}.weight"].numpy(), tensors[f"{level}.bias"].numpy()) for level in range(len(tensors) // 2)
+    ]
+
+
+def save(network: Network, path: Path) -> None:
+    """Store an expert for `load`."""
+    tensors: dict[str, Tensor] = {}
+    for level, (weight, bias) in enumerate(network):
+        tensors |= {f"{level}.weight": torch.from_numpy(weight), f"{level}.bias": torch.from_numpy(bias)}
+    write_atomically(path, lambda temporary: save_file(tensors, temporary))
+
+
+def play(task: RobotPolicyTask, network: Network, seeds: range, noise: tuple[Array, int] | None = None) -> Episodes:
+    """Episodes of the expert; `noise` = (standard deviation [outputs], seed) makes its actions Gaussian."""
+    generator = np.random.default_rng(noise[1]) if noise else None
+
+    def act(observations: Array) -> Array:
+        actions = mean_action(network, observations)
+        if noise and generator:
+            actions = actions + noise[0] * generator.standard_normal(actions.shape, np.float32)
+        return actions
+
+    return rollout(task, seeds, act)
+
+
+def evaluate(task: RobotPolicyTask, network: Network, pool: Any, workers: int, seeds: range) -> list[Episodes]:
+    """Deterministic episodes of the expert over seeds, shared out to the pool's workers."""
+    from joblib import delayed  # noqa: PLC0415  part of the simulator's extra
+
+    chunks = [seeds[start : start + 50] for start in range(0, len(seeds), 50)]
+    return list(pool(delayed(play)(task, network, chunk) for chunk in chunks))
+
+
+class Training:
+    """PPO's state: everything that a resumed run needs to go on as if it had not stopped."""
+
+    def __init__(self, task: RobotPolicyTask, config: ExpertConfig) -> None:
+        self.config = config
+        self.task = task
+        self.generator = torch.Generator().manual_seed(config.seed)
+        with torch.random.fork_rng():
+            torch.manual_seed(config.seed)
+            self.model = ActorCritic(task.inputs, task.outputs, config.hidden, config.log_std)
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=config.learning_rate, eps=1e-5)
+        self.iteration = 0
+        self.best_return = 0.0
+
+    @property
+    def steps(self) -> int:
+        """Environment steps taken so far."""
+        return self.iteration * self.config.environments * self.task.episode_steps
+
+    def save(self, path: Path) -> None:
+        """Write the state for `restore`, atomically."""
+        state = {
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "iteration": self.iteration,
+            "best_return": self.best_return,
+        }
+        write_atomically(path, lambda temporary: torch.save(state, temporary))
+
+    def restore(self, path: Path) -> None:
+        """Take up the state that `save` wrote."""
+        state = torch.load(path, weights_only=True)
+        self.model.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        self.iteration, self.best_return = state["iteration"], state["best_return"]
+
+    def iterate(self, pool: Any, workers: int) -> float:
+        """Roll out one episode per environment, update, and return the mean undiscounted return."""
+        from joblib import delayed  # noqa: PLC0415  part of the simulator's extra
+
+        config = self.config
+        network = network_of(self.model.actor)
+        std = self.model.log_std.detach().exp().numpy()
+        share = config.environments // workers
+        first = TRAINING_SEEDS + self.iteration * config.environments
+        jobs = []
+        for worker in range(workers):
+            seeds = range(first + worker * share, first + (worker + 1) * share)
+            jobs.append(delayed(play)(self.task, network, seeds, (std, first + worker)))
+        episodes = pool(jobs)
+        observations = torch.from_numpy(np.concatenate([part.observations for part in episodes], axis=1))
+        actions = torch.from_numpy(np.concatenate([part.actions for part in episodes], axis=1))
+        rewards = torch.from_numpy(np.concatenate([part.rewards for part in episodes], axis=1))
+        self._update(observations, actions, rewards)
+        self.iteration += 1
+        return float(rewards.sum(0).mean())
+
+    def _update(self, observations: Tensor, actions: Tensor, rewards: Tensor) -> None:
+        config = self.config
+        rate = config.learning_rate * max(1 - self.steps / config.total_steps, 0.05)
+        self.optimizer.param_groups[0]["lr"] = rate
+        with torch.no_grad():
+            values = self.model.critic(observations)[..., 0]
+            advantages = generalised_advantages(rewards, values, config.gamma, config.gae_lambda).flatten()
+            targets = advantages + values[:-1].flatten()
+            states, taken = observations[:-1].flatten(0, 1), actions.flatten(0, 1)
+            old = self.model.log_prob(states, taken)
+        for _ in range(config.epochs):
+            for rows in torch.split(torch.randperm(len(states), generator=self.generator), config.minibatch):
+                ratio_log = self.model.log_prob(states[rows], taken[rows]) - old[rows]
+                ratio = ratio_log.exp()
+                if ((ratio - 1) - ratio_log).mean() > config.target_kl:
+                    return
+                advantage = advantages[rows]
+                advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+                clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
+                policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()
+                value_loss = 0.5 * (self.model.critic(states[rows])[:, 0] - targets[rows]).square().mean()
+                self.optimizer.zero_grad()
+                (policy_loss + config.value_weight * value_loss).backward()
+                nn.utils.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
+                self.optimizer.step()
+
+
+def generalised_advantages(rewards: Tensor, values: Tensor, gamma: float, gae_lambda: float) -> Tensor:
+    """GAE advantages [T, n] from rewards [T, n] and values [T + 1, n]; the end is a time limit, so it bootstraps."""
+    advantages = torch.zeros_like(rewards)
+    running = torch.zeros_like(rewards[0])
+    for step in reversed(range(len(rewards))):
+        delta = rewards[step] + gamma * values[step + 1] - values[step]
+        running = delta + gamma * gae_lambda * running
+        advantages[step] = running
+    return advantages
+
+
+def train(
+    task: RobotPolicyTask, config: ExpertConfig, folder: Path, workers: int, log: Callable[[str], None]
+) -> dict[str, Any]:
+    """Train until the stopping scores or `total_steps`; `folder` gets the state, a log and the best expert.
+
+    Returns the record of the best expert: its deterministic scores over 200 episodes, steps and seconds.
+    """
+    from joblib import Parallel  # noqa: PLC0415  part of the simulator's extra
+
+    folder.mkdir(parents=True, exist_ok=True)
+    training = Training(task, config)
+    if (folder / "state.pt").exists():
+        training.restore(folder / "state.pt")
+        log(f"resuming the expert at {training.steps:,} steps")
+    record: dict[str, Any] = json.loads((folder / "record.json").read_text()) if training.best_return else {}
+    with Parallel(n_jobs=workers) as pool:
+        while training.steps < config.total_steps:
+            started = time.monotonic()
+            mean_return = training.iterate(pool, workers)
+            if training.iteration % config.evaluate_every:
+                continue
+            scores = summarise(evaluate(task, network_of(training.model.actor), pool, workers, EVALUATION_SEEDS))
+            entry = {"steps": training.steps, "training_return": mean_return, **scores}
+            log(f"expert {json.dumps(entry)} ({time.monotonic() - started:.1f} s)")
+            with (folder / "log.jsonl").open("a") as lines:
+                lines.write(json.dumps(entry) + "\n")
+            if scores["return"] > training.best_return:
+                training.best_return = scores["return"]
+                save(network_of(training.model.actor), folder / "expert.safetensors")
+                record = entry
+                (folder / "record.json").write_text(json.dumps(record))
+            training.save(folder / "state.pt")
+            if scores["success_at_end"] >= config.stop_success and scores["return"] >= config.stop_return:
+                break
+    return record
+
+
+def summarise(episodes: list[Episodes]) -> dict[str, float]:
+    """Mean return, success_once and success_at_end over episodes."""
+    success = np.concatenate([part.success for part in episodes], axis=1)
+    rewards = np.concatenate([part.rewards for part in episodes], axis=1)
+    return {
+        "return": float(rewards.sum(0).mean()),
+        "success_once": float(success.any(0).mean()),
+        "success_at_end": float(success[-1].mean()),
+        "episodes": success.shape[1],
+    }
