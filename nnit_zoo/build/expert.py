@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from nnit_zoo.build.files import write_atomically
+from nnit_zoo.build.files import write_atomically, write_json
 from nnit_zoo.sim.rollout import Episodes, rollout
 from nnit_zoo.sim.tabletop import Array
 from nnit_zoo.tasks.robot import RobotPolicyTask
@@ -243,7 +243,7 @@ def train(
         log(f"resuming the expert at {training.steps:,} steps")
     record: dict[str, Any] = json.loads((folder / "record.json").read_text()) if training.best_return else {}
     with Parallel(n_jobs=workers) as pool:
-        while training.steps < config.total_steps:
+        while training.steps < config.total_steps and not good_enough(config, record):
             started = time.monotonic()
             mean_return = training.iterate(pool, workers)
             if training.iteration % config.evaluate_every:
@@ -257,11 +257,14 @@ def train(
                 training.best_return = scores["return"]
                 save(network_of(training.model.actor), folder / "expert.safetensors")
                 record = entry
-                (folder / "record.json").write_text(json.dumps(record))
+                write_json(folder / "record.json", record)
             training.save(folder / "state.pt")
-            if scores["success_at_end"] >= config.stop_success and scores["return"] >= config.stop_return:
-                break
     return record
+
+
+def good_enough(config: ExpertConfig, record: dict[str, Any]) -> bool:
+    """Whether the best expert so far reaches the scores to stop at."""
+    return bool(record) and record["success_at_end"] >= config.stop_success and record["return"] >= config.stop_return
 
 
 def summarise(episodes: list[Episodes]) -> dict[str, float]:
