@@ -1,0 +1,161 @@
+"""Where a zoo's files lie, what they promise, and whether they hold it; imports no torch.
+
+A zoo folder holds `index.parquet` (a row per policy), one safetensors shard per architecture and `manifest.json` with
+the size and SHA-256 of each of them. The embedded folder of a task, in the package, holds the same index and manifest
+beside the GHNs from which the shards are made.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+import shutil
+from pathlib import Path
+from typing import Literal
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from huggingface_hub import cached_assets_path
+from pydantic import BaseModel, Field, ValidationError
+
+from nnit_zoo.errors import UserError, unknown_name
+
+EMBEDDED = Path(__file__).parent / "data"
+INDEX = "index.parquet"
+MANIFEST = "manifest.json"
+INDEX_SCHEMA = pa.schema(
+    [
+        ("id", pa.string()),
+        ("task", pa.string()),
+        ("architecture", pa.string()),
+        ("ghn_seed", pa.int32()),
+        ("split", pa.string()),
+        ("success_once", pa.float64()),
+        ("success_at_end", pa.float64()),
+        ("return", pa.float64()),
+        ("episodes", pa.int32()),
+        ("shard", pa.string()),
+        ("row", pa.int32()),
+        ("sha256", pa.string()),
+    ]
+)
+
+
+class Entry(BaseModel):
+    """What the manifest promises of one file; `size` in bytes."""
+
+    sha256: str
+    size: int = Field(alias="bytes")
+
+    @classmethod
+    def of(cls, content: bytes) -> Entry:
+        """The entry that `content` fulfils."""
+        return cls(sha256=hashlib.sha256(content).hexdigest(), bytes=len(content))
+
+    def describes(self, path: Path) -> bool:
+        """Whether `path` is a file with this size and SHA-256."""
+        return path.is_file() and path.stat().st_size == self.size and sha256_of(path) == self.sha256
+
+
+class Manifest(BaseModel):
+    """manifest.json of a zoo: its task, the network sizes, and an entry per file."""
+
+    format: Literal[1] = 1
+    task: str
+    inputs: int
+    outputs: int
+    index: Entry
+    shards: dict[str, Entry]
+
+    @classmethod
+    def read(cls, folder: Path) -> Manifest:
+        """The manifest in `folder`; raises UserError if there is none or it cannot be understood."""
+        path = folder / MANIFEST
+        try:
+            return cls.model_validate_json(path.read_text())
+        except (FileNotFoundError, NotADirectoryError):
+            raise UserError(
+                f"no zoo in {folder}; make one with: nnit-zoo download --task TASK --folder {folder}"
+            ) from None
+        except (ValidationError, UnicodeDecodeError):
+            raise UserError(
+                f"{path} is damaged, or of another version of nnit; nnit-zoo download makes it again"
+            ) from None
+
+    def to_bytes(self) -> bytes:
+        """The content of manifest.json, the same bytes for the same manifest."""
+        return (self.model_dump_json(indent=2, by_alias=True) + "\n").encode()
+
+    def missing(self, folder: Path) -> dict[str, Entry]:
+        """The files that `folder` lacks or holds in another form."""
+        return {name: entry for name, entry in self.files.items() if not entry.describes(folder / name)}
+
+    @property
+    def files(self) -> dict[str, Entry]:
+        """The entry of each file: the shards and the index."""
+        return {**self.shards, INDEX: self.index}
+
+    @property
+    def size(self) -> int:
+        """Size of all files that the manifest lists, in bytes."""
+        return sum(entry.size for entry in self.files.values())
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, as hexadecimal text."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_index(path: Path, architecture: str | None = None) -> pa.Table:
+    """The rows of an index file, of one architecture if given; columns as in INDEX_SCHEMA."""
+    table = pq.ParquetFile(path).read()
+    return table if architecture is None else table.filter(pc.equal(table["architecture"], architecture))
+
+
+def tasks_with_zoo() -> tuple[str, ...]:
+    """The tasks whose zoo is embedded in this package."""
+    return tuple(sorted(path.parent.name for path in EMBEDDED.glob(f"*/{MANIFEST}")))
+
+
+def embedded(task: str) -> Path:
+    """The folder with the task's embedded zoo; raises UserError, with near names, if there is none."""
+    if task not in tasks_with_zoo():
+        raise unknown_name("zoo", task, tasks_with_zoo())
+    return EMBEDDED / task
+
+
+def default_folder(task: str) -> Path:
+    """Where `nnit-zoo download` puts the task's zoo: in the assets cache of huggingface_hub (HF_HOME moves it).
+
+    Raises UserError if that folder cannot be made.
+    """
+    try:
+        return cached_assets_path("nnit", "zoo", task)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"no cache folder for zoos ({error}); set HF_HOME to a folder that you can write, or give --folder"
+        ) from None
+
+
+def download_command(task: str, folder: Path) -> str:
+    """The command that makes the zoo in `folder`, or mends it."""
+    where = "" if folder.resolve() == default_folder(task) else f" --folder {shlex.quote(str(folder))}"
+    return f"nnit-zoo download --task {task}{where}"
+
+
+def readable(size: int) -> str:
+    """A number of bytes for people: `17.2 MB`."""
+    value, unit = float(size), "B"
+    for larger in ("kB", "MB", "GB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.1f} {unit}" if unit != "B" else f"{size} B"
+
+
+def free_bytes(folder: Path) -> int:
+    """Free space, in bytes, on the disk that holds `folder` or would hold it."""
+    existing = next(path for path in (folder, *folder.resolve().parents) if path.exists())
+    return shutil.disk_usage(existing).free

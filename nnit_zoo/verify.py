@@ -1,0 +1,85 @@
+"""A deep check of a zoo folder: checksums, schema, splits, finite parameters and a forward pass of every policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nnit_zoo import files
+from nnit_zoo.architecture import Architecture, split_of
+from nnit_zoo.errors import UserError
+from nnit_zoo.zoo import HELDOUT_SEEDS_FROM, damaged, policy_hashes, read_shard
+
+
+def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[str]:
+    """What is wrong with the zoo in `folder`, a sentence per problem; empty if it is sound.
+
+    `progress` is called with the number of newly checked shards. Raises UserError if the folder has no
+    manifest that can be read.
+    """
+    manifest = files.Manifest.read(folder)
+    if not manifest.index.describes(folder / files.INDEX):
+        return [str(damaged(folder / files.INDEX, manifest.task))]
+    index = files.read_index(folder / files.INDEX)
+    if not index.schema.equals(files.INDEX_SCHEMA):
+        return [f"{folder / files.INDEX} has other columns than {', '.join(files.INDEX_SCHEMA.names)}"]
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in manifest.shards}
+    problems = []
+    for row in index.to_pylist():
+        rows.setdefault(row["shard"], []).append(row)
+        problems += _row_problems(row, manifest.task)
+    if len(set(index["id"].to_pylist())) != len(index):
+        problems.append(f"{folder / files.INDEX} lists a policy twice")
+    for name in sorted(rows.keys() - manifest.shards.keys()):
+        problems.append(f"{folder / files.INDEX} lists policies in {name}, which {files.MANIFEST} does not")
+    for name, entry in manifest.shards.items():
+        architecture = Architecture.parse(Path(name).stem, manifest.inputs, manifest.outputs)
+        if entry.describes(folder / name):
+            problems += _shard_problems(folder / name, architecture, rows[name])
+        else:
+            problems.append(str(damaged(folder / name, manifest.task)))
+        if progress:
+            progress(1)
+    return problems
+
+
+def _row_problems(row: dict[str, Any], task: str) -> list[str]:
+    """A row of the index must follow from its architecture and GHN seed."""
+    heldout = row["ghn_seed"] >= HELDOUT_SEEDS_FROM
+    expected = {
+        "id": f"{task}/{row['architecture']}/{row['ghn_seed']:03d}",
+        "task": task,
+        "split": "heldout_seed" if heldout else split_of(row["architecture"]),
+        "shard": f"{row['architecture']}.safetensors",
+    }
+    return [
+        f"policy {row['id']} has {column} '{row[column]}' in the index, but should have '{value}'"
+        for column, value in expected.items()
+        if row[column] != value
+    ]
+
+
+def _shard_problems(path: Path, architecture: Architecture, rows: list[dict[str, Any]]) -> list[str]:
+    try:
+        batch = read_shard(path, architecture)
+    except UserError as error:
+        return [str(error)]
+    if any(layer.dtype != torch.float16 for layer in batch.layers):
+        return [f"{path} does not hold float16 parameters"]
+    if [row["row"] for row in rows] != list(range(len(batch))):
+        return [f"{path} holds {len(batch)} policies, and the index does not list exactly these"]
+    observations = torch.randn(1, 16, architecture.inputs, generator=torch.Generator().manual_seed(0))
+    working = batch.to(torch.float32)(observations).isfinite().flatten(1).all(1) & batch.finite()
+    intact = [sha256 == row["sha256"] for sha256, row in zip(policy_hashes(batch), rows, strict=True)]
+    problems = [
+        f"policy {row['id']} in {path} gives no finite actions" for row, ok in zip(rows, working, strict=True) if not ok
+    ]
+    problems += [
+        f"policy {row['id']} in {path} is not the one in the index"
+        for row, ok in zip(rows, intact, strict=True)
+        if not ok
+    ]
+    return problems

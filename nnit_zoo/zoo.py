@@ -1,0 +1,214 @@
+"""Zoo: a task's stored policies, read through an Arrow index and memory-mapped safetensors shards."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import torch
+from safetensors import SafetensorError, safe_open
+
+from nnit_zoo import architecture as known
+from nnit_zoo import files
+from nnit_zoo.architecture import Architecture, split_of
+from nnit_zoo.errors import UserError, unknown_name
+from nnit_zoo.policy import PolicyBatch
+
+HELDOUT_SEEDS_FROM = 128
+SPLITS = (*known.SPLITS, "heldout_seed")
+
+
+class Zoo:
+    """The policies of one task in a folder; open one with `Zoo.open` or `nnit_zoo.load`.
+
+    `index` has a row per policy: id, task, architecture, ghn_seed, split, success_once, success_at_end, return,
+    episodes, shard, row, sha256. `split` is `seen`, `unseen`, `excluded`, or `heldout_seed` for GHN seeds from 128 on.
+    """
+
+    def __init__(self, folder: Path, manifest: files.Manifest, index: pa.Table) -> None:
+        self.folder = folder
+        self.manifest = manifest
+        self.index = index
+        self._shards: dict[str, PolicyBatch] = {}
+
+    @classmethod
+    def open(cls, folder: Path | str) -> Zoo:
+        """The zoo in `folder`; raises UserError if there is none or its index is damaged."""
+        folder = Path(folder)
+        manifest = files.Manifest.read(folder)
+        if not manifest.index.describes(folder / files.INDEX):
+            raise damaged(folder / files.INDEX, manifest.task)
+        return cls(folder, manifest, files.read_index(folder / files.INDEX))
+
+    @property
+    def task(self) -> str:
+        """Name of the task that the policies solve."""
+        return self.manifest.task
+
+    def __len__(self) -> int:
+        return int(self.index.num_rows)
+
+    def architectures(self, split: str) -> tuple[Architecture, ...]:
+        """The architectures that have policies in `split`, in index order; raises UserError for an unknown split."""
+        if split not in SPLITS:
+            raise unknown_name("split", split, SPLITS)
+        rows = self.index.filter(pc.equal(self.index["split"], split))
+        return tuple(self._parse(text) for text in pc.unique(rows["architecture"]).to_pylist())
+
+    def batch(self, architecture: Architecture | str, split: str | None = None) -> PolicyBatch:
+        """The policies of an architecture in one split, or in all, as stored: float16, memory-mapped, in index order.
+
+        Raises UserError if there are none, or if the shard is missing or damaged (its SHA-256 is checked once).
+        """
+        rows = self._rows(str(architecture), split)["row"].to_pylist()
+        # An architecture's rows are sorted by GHN seed, so those of a split are neighbours: a slice stays mapped.
+        return self._shard(str(architecture))[rows[0] : rows[-1] + 1]
+
+    def ghn_seeds(self, architecture: Architecture | str, split: str | None = None) -> tuple[int, ...]:
+        """The GHN seed of each policy of `batch(architecture, split)`."""
+        return tuple(self._rows(str(architecture), split)["ghn_seed"].to_pylist())
+
+    def training_view(self) -> TrainingView:
+        """What a generator may learn from: the policies of seen architectures and training seeds."""
+        return self._view("seen", reference=False)
+
+    def reference_view(self, split: str) -> TrainingView:
+        """The policies of a split as a yardstick (oracle row, novelty), marked so that no generator trains on them.
+
+        Raises UserError if the zoo has none.
+        """
+        if not self.architectures(split):
+            raise UserError(f"the zoo of {self.task} has no policies in split '{split}'")
+        return self._view(split, reference=True)
+
+    def _view(self, split: str, *, reference: bool) -> TrainingView:
+        architectures = self.architectures(split)
+        batches = {architecture: self.batch(architecture, split) for architecture in architectures}
+        seeds = {architecture: self.ghn_seeds(architecture, split) for architecture in architectures}
+        return TrainingView(self.task, batches, seeds, reference)
+
+    def _parse(self, text: str) -> Architecture:
+        return Architecture.parse(text, self.manifest.inputs, self.manifest.outputs)
+
+    def _rows(self, architecture: str, split: str | None) -> pa.Table:
+        chosen = pc.equal(self.index["architecture"], architecture)
+        if split is not None:
+            chosen = pc.and_(chosen, pc.equal(self.index["split"], split))
+        rows = self.index.filter(chosen)
+        if not rows.num_rows:
+            splits = SPLITS if split is None else (split,)
+            names = {str(each) for name in splits for each in self.architectures(name)}
+            place = "zoo" if split is None else split
+            raise unknown_name(f"{place} architecture", architecture, names)
+        return rows
+
+    def _shard(self, architecture: str) -> PolicyBatch:
+        if architecture not in self._shards:
+            name = f"{architecture}.safetensors"
+            path = self.folder / name
+            if not self.manifest.shards[name].describes(path):
+                raise damaged(path, self.task)
+            self._shards[architecture] = read_shard(path, self._parse(architecture))
+        return self._shards[architecture]
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """Policies per architecture, given to generators; refuses what they must not learn from.
+
+    A view marked `reference` holds yardsticks instead, and `Generator.fit` refuses it. Without `seeds`, as in tests,
+    a policy's GHN seed is its row number. Raises UserError if it is not a reference view and holds an unseen or
+    excluded architecture or a held-out seed.
+    """
+
+    task: str
+    batches: Mapping[Architecture, PolicyBatch]
+    seeds: Mapping[Architecture, tuple[int, ...]] | None = None
+    reference: bool = False
+
+    def __post_init__(self) -> None:
+        if self.reference:
+            return
+        for architecture in self.batches:
+            if split_of(architecture) in ("unseen", "excluded"):
+                raise UserError(f"{architecture} is {split_of(architecture)}: its policies are never for training")
+            if max(self.ghn_seeds(architecture), default=0) >= HELDOUT_SEEDS_FROM:
+                raise UserError(f"GHN seeds from {HELDOUT_SEEDS_FROM} on are held out: never for training")
+
+    @property
+    def architectures(self) -> tuple[Architecture, ...]:
+        """The architectures that have policies here."""
+        return tuple(self.batches)
+
+    def batch(self, architecture: Architecture) -> PolicyBatch:
+        """The policies of an architecture in float32; raises UserError if it is not in this view."""
+        self._check_here(architecture)
+        return self.batches[architecture].to(torch.float32)
+
+    def ghn_seeds(self, architecture: Architecture) -> tuple[int, ...]:
+        """The GHN seed of each policy of `batch(architecture)`; raises UserError if it is not in this view."""
+        self._check_here(architecture)
+        if self.seeds is None:
+            return tuple(range(len(self.batches[architecture])))
+        return self.seeds[architecture]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.batches.values()))
+
+    def _check_here(self, architecture: Architecture) -> None:
+        if architecture in self.batches:
+            return
+        if not self.reference and split_of(architecture) in ("unseen", "excluded"):
+            raise UserError(f"{architecture} is {split_of(architecture)}: its policies are never for training")
+        raise unknown_name("architecture in this view", str(architecture), map(str, self.batches))
+
+
+def load(task: str, folder: Path | str | None = None) -> Zoo:
+    """The task's zoo in `folder`, by default where `nnit-zoo download` puts it.
+
+    Raises UserError, naming the command that helps, if it is missing, damaged, another task's, or another version's.
+    """
+    return Zoo.open(locate(task, folder))
+
+
+def locate(task: str, folder: Path | str | None = None) -> Path:
+    """The folder of the task's zoo, if its manifest is the expected one; raises UserError as `load` does."""
+    place = files.default_folder(task) if folder is None else Path(folder)
+    release = files.Manifest.read(files.embedded(task)) if folder is None else None
+    if not (place / files.MANIFEST).is_file():
+        raise UserError(f"no zoo of {task} in {place} yet; run: {files.download_command(task, place)}")
+    manifest = files.Manifest.read(place)
+    if manifest.task != task:
+        raise UserError(f"{place} holds the zoo of {manifest.task}, not of {task}")
+    if release is not None and manifest != release:
+        raise UserError(
+            f"the zoo in {place} is from another version of nnit; run: {files.download_command(task, place)}"
+        )
+    return place
+
+
+def read_shard(path: Path, architecture: Architecture) -> PolicyBatch:
+    """All policies in a shard, memory-mapped; raises UserError if the file is not such a shard.
+
+    Tensor `layers.L` is layer L of every policy, float16 [n, out, in + 1].
+    """
+    try:
+        with safe_open(path, framework="pt") as shard:
+            layers = tuple(shard.get_tensor(f"layers.{depth}") for depth in range(len(architecture.block_shapes)))
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{path} is not a shard of {architecture}: {error}") from None
+    return PolicyBatch(architecture, layers)
+
+
+def policy_hashes(batch: PolicyBatch) -> list[str]:
+    """Each policy's SHA-256: of its stored parameters, layer by layer, row by row, as in `PolicyBatch.flat`."""
+    return [hashlib.sha256(flat.tobytes()).hexdigest() for flat in batch.flat().numpy()]
+
+
+def damaged(path: Path, task: str) -> UserError:
+    """The error for a file of a zoo that is not what the manifest promises."""
+    return UserError(f"{path} is missing or damaged; mend it with: {files.download_command(task, path.parent)}")
