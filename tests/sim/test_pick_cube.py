@@ -90,10 +90,7 @@ def expert_policy(noise, copies):
     for level, (weight, bias) in enumerate(NETWORK):
         block = torch.from_numpy(np.concatenate([weight, bias[:, None]], axis=1)).double()
         if level == 0:
-            mean, std = (
-                torch.from_numpy(TASK.observation_mean).double(),
-                torch.from_numpy(TASK.observation_std).double(),
-            )
+            mean, std = (torch.from_numpy(each).double() for each in (TASK.observation_mean, TASK.observation_std))
             block = torch.cat([block[:, :-1] * std, block[:, -1:] + (block[:, :-1] @ mean)[:, None]], dim=1)
         block = block * (1 + noise * torch.randn((copies, *block.shape), generator=generator, dtype=torch.float64))
         layers.append(block.float())
