@@ -1,0 +1,155 @@
+"""What a person sees of a run: progress and notes on stderr, the result table on stdout."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from nnit_bench.protocol import Protocol
+from nnit_bench.statistics import METRICS, Estimate, Summary
+
+if TYPE_CHECKING:
+    from nnit_bench.runner import Outcome, ZooRow
+
+SECONDS_BETWEEN_LINES = 20
+
+
+class Display:
+    """Notes and progress on stderr: bars on a terminal, else a line now and then, nothing at all if `quiet`."""
+
+    def __init__(self, quiet: bool) -> None:
+        self.quiet = quiet
+        self._console = Console(stderr=True)
+
+    def note(self, text: str) -> None:
+        """Say something that is not a result."""
+        if not self.quiet:
+            self._console.print(Text(text), soft_wrap=True)
+
+    @contextmanager
+    def stage(self, label: str, total: int) -> Iterator[Callable[[int], None]]:
+        """Show a stage of work; gives a function that takes the number of newly finished items."""
+        if self.quiet:
+            yield lambda done: None
+        elif self._console.is_terminal:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                _Rate(),
+                TimeRemainingColumn(),
+            )
+            with Progress(*columns, console=self._console, transient=True) as bars:
+                bar = bars.add_task(label, total=total)
+                yield lambda done: bars.advance(bar, done)
+        else:
+            yield _Lines(self, label, total).advance
+
+    @contextmanager
+    def steps(self, label: str) -> Iterator[Callable[[int, int], None]]:
+        """Show work that says itself how much it is; gives a function that takes the items done and those in all."""
+        with ExitStack() as stack:
+            done_before = 0
+            advance: Callable[[int], None] | None = None
+
+            def report(done: int, total: int) -> None:
+                nonlocal done_before, advance
+                advance = advance or stack.enter_context(self.stage(label, total))
+                advance(done - done_before)
+                done_before = done
+
+            yield report
+
+
+class _Rate(TextColumn):
+    """Finished items per second."""
+
+    def __init__(self) -> None:
+        super().__init__("")
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.speed:.0f}/s" if task.speed else "")
+
+
+class _Lines:
+    """Progress for logs: a line at the start, every 20 seconds, and at the end."""
+
+    def __init__(self, display: Display, label: str, total: int) -> None:
+        self._display, self._label, self._total, self._done = display, label, total, 0
+        self._start = self._last = time.monotonic()
+        display.note(f"{label}: {total}")
+
+    def advance(self, done: int) -> None:
+        self._done += done
+        now = time.monotonic()
+        seconds = now - self._start
+        if self._done >= self._total:
+            self._display.note(f"{self._label}: {self._total} of {self._total} in {seconds:.0f} s")
+        elif now - self._last >= SECONDS_BETWEEN_LINES and self._done:
+            left = seconds / self._done * (self._total - self._done)
+            rate = self._done / seconds
+            self._display.note(f"{self._label}: {self._done} of {self._total}, {rate:.0f}/s, {left:.0f} s left")
+            self._last = now
+
+
+def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow | None) -> None:
+    """Print the result table on stdout: a row per method, and the zoo's own."""
+    policies, architectures = sum(protocol.policies.values()), len(protocol.policies)
+    top = f"top-{protocol.top}"
+    table = Table(
+        title=f"{protocol.task}, {protocol.split}: {policies} policies, {architectures} architectures, "
+        f"{protocol.episodes} episodes per policy\n",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        show_edge=False,
+    )
+    table.add_column("success\nat end, %", overflow="fold", min_width=10)
+    for heading in ("mean", top, f"{top}\nheld out", "worst\narch.", "success\nonce, %", "return"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for outcome in outcomes:
+        table.add_row(outcome.record.method.name.rpartition("/")[2], *_cells(outcome.summary))
+    if zoo_row:
+        table.add_row("zoo *", *_cells(zoo_row.summary))
+    console = Console(file=sys.stdout, highlight=False, markup=False)
+    console.print(table)
+    console.print()
+    console.print(
+        f"Below each number its 95 % interval. {top}: chosen and scored on the same episodes; held out: on others."
+    )
+    if zoo_row:
+        console.print(
+            f"* the {zoo_row.policies} stored policies of these architectures, as scored when the zoo was built, "
+            f"{zoo_row.episodes} episodes each"
+        )
+    for outcome in outcomes:  # a row of zeros should say why
+        for reason, count in outcome.zeroed.items():
+            console.print(f"{outcome.record.method.name}: {count} policies scored 0: {reason}")
+
+
+def _cells(summary: Summary) -> list[str]:
+    at_end, once, returns = (summary.estimates[metric] for metric in METRICS)
+    return [
+        _cell(at_end["mean"], 100),
+        _cell(at_end["top"], 100),
+        _cell(at_end.get("top_heldout"), 100),
+        f"{_cell(at_end['worst'], 100)}\n{summary.worst}",
+        _cell(once["mean"], 100),
+        _cell(returns["mean"], 1),
+    ]
+
+
+def _cell(estimate: Estimate | None, scale: int) -> str:
+    if estimate is None:
+        return "-"
+    value, low, high = (f"{number * scale:.1f}".replace("100.0", "100") for number in estimate)  # fits 80 columns
+    return f"{value}\n{low}-{high}"

@@ -1,0 +1,1 @@
+"""The leaderboard: reads the result files that nnit-bench writes, and nothing else."""
