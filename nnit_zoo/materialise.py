@@ -103,14 +103,15 @@ class _Source:
     def __init__(self, data_folder: Path) -> None:
         try:
             with safe_open(data_folder / GHNS, framework="pt") as file:
-                metadata = file.metadata()
+                metadata = json.loads(file.metadata()["nnit"])
                 stacked = {name: file.get_tensor(name).double() for name in sorted(file.keys())}
         except (SafetensorError, OSError) as error:
             raise UserError(f"{data_folder / GHNS} is missing or damaged ({error}); install nnit again") from None
         self.task: str = metadata["task"]
-        self.inputs, self.outputs = int(metadata["inputs"]), int(metadata["outputs"])
+        self.inputs: int = metadata["inputs"]
+        self.outputs: int = metadata["outputs"]
         self._ghns = {}
-        for number, seed in enumerate(json.loads(metadata["ghn_seeds"])):
+        for number, seed in enumerate(metadata["ghn_seeds"]):
             state = {name: tensor[number] for name, tensor in stacked.items()}
             self._ghns[seed] = GHN.from_state(self.inputs, self.outputs, state).double()
         self.rows = self._kept_rows(data_folder / SELECTION)

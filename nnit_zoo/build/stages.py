@@ -36,6 +36,7 @@ from nnit_zoo.tasks.robot import RobotPolicyTask
 from nnit_zoo.tasks.task import data_folder
 
 Stage = Literal["all", "expert", "states", "ghns", "scores", "pack"]
+STAGES = ("expert", "states", "ghns", "scores", "pack")
 SCORING_SEEDS = range(10_000_000, 10_000_064)  # NNiT appendix C: 64 episodes a candidate
 POLICIES_PER_ARCHITECTURE = 100
 STD_FLOOR = 0.05  # keeps near-constant observations from being blown up; decides the weight error policies survive
@@ -61,7 +62,7 @@ def build(
     if not isinstance(chosen, RobotPolicyTask):
         raise UserError(f"{task} cannot be built by this command yet")
     builder = Builder(chosen, work / task, seeds, workers)
-    for name in ("expert", "states", "ghns", "scores", "pack"):
+    for name in STAGES:
         if stage in ("all", name):
             getattr(builder, name)()
 
@@ -124,12 +125,9 @@ class Builder:
                 log(f"ghns: {line}")
         states = [load_file(self._ghn(seed)) for seed in self.seeds]
         stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
-        note = {
-            "task": self.task.name,
-            "ghn_seeds": json.dumps(list(self.seeds)),
-            "inputs": str(self.task.inputs),
-            "outputs": str(self.task.outputs),
-        }
+        sizes = {"inputs": self.task.inputs, "outputs": self.task.outputs}
+        # One entry, because safetensors writes several in an order that changes from run to run.
+        note = {"nnit": json.dumps({"task": self.task.name, **sizes, "ghn_seeds": list(self.seeds)})}
         write_atomically(self.data / "ghns.safetensors", lambda temporary: save_file(stacked, temporary, note))
         self._record(distill={**self.distill_config.model_dump(), "states": self._count_states(), "commit": _commit()})
 

@@ -24,8 +24,8 @@ def make_data_folder(folder: Path, task: str = "PickCube-v1") -> Path:
     folder.mkdir(parents=True)
     states = [GHN(42, 8, seed).state_dict() for seed in SEEDS]
     stacked = {name: torch.stack([state[name] for state in states]).half() for name in states[0]}
-    metadata = {"task": task, "ghn_seeds": json.dumps(SEEDS), "inputs": "42", "outputs": "8"}
-    save_file(stacked, folder / "ghns.safetensors", metadata)
+    metadata = {"task": task, "inputs": 42, "outputs": 8, "ghn_seeds": SEEDS}
+    save_file(stacked, folder / "ghns.safetensors", {"nnit": json.dumps(metadata)})
     rows = [
         {
             "architecture": architecture,
