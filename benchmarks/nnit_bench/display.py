@@ -101,8 +101,11 @@ class _Lines:
             self._last = now
 
 
+LABELS = {"success_at_end": "success at end, %", "success_once": "success once, %", "return": "return"}
+
+
 def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow | None) -> None:
-    """Print the result table on stdout: a row per method, and the zoo's own."""
+    """Print the result table on stdout: a row per method and score, and the zoo's own."""
     policies, architectures = sum(protocol.policies.values()), len(protocol.policies)
     top = f"top-{protocol.top}"
     table = Table(
@@ -113,16 +116,16 @@ def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow
         padding=(0, 1, 0, 0),
         show_edge=False,
     )
-    table.add_column("success\nat end, %", overflow="fold", min_width=10)
-    for heading in ("mean", top, f"{top}\nheld out", "worst\narch.", "success\nonce, %", "return"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("", overflow="fold")
+    table.add_column("")
+    for heading in ("mean", top, f"{top} held out", "worst arch."):
+        table.add_column(heading, justify="right")
     for outcome in outcomes:
-        table.add_row(outcome.record.method.name.rpartition("/")[2], *_cells(outcome.summary))
+        _add(table, outcome.record.method.name.rpartition("/")[2], outcome.summary)
     if zoo_row:
-        table.add_row("zoo *", *_cells(zoo_row.summary))
+        _add(table, "zoo *", zoo_row.summary)
     console = Console(file=sys.stdout, highlight=False, markup=False)
-    console.print(table)
-    console.print()
+    console.print(table, end="\n\n")
     console.print(
         f"Below each number its 95 % interval. {top}: chosen and scored on the same episodes; held out: on others."
     )
@@ -136,16 +139,16 @@ def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow
             console.print(f"{outcome.record.method.name}: {count} policies scored 0: {reason}")
 
 
-def _cells(summary: Summary) -> list[str]:
-    at_end, once, returns = (summary.estimates[metric] for metric in METRICS)
-    return [
-        _cell(at_end["mean"], 100),
-        _cell(at_end["top"], 100),
-        _cell(at_end.get("top_heldout"), 100),
-        f"{_cell(at_end['worst'], 100)}\n{summary.worst}",
-        _cell(once["mean"], 100),
-        _cell(returns["mean"], 1),
-    ]
+def _add(table: Table, name: str, summary: Summary) -> None:
+    """Add the rows of one method, one per score."""
+    for metric in METRICS:
+        scale = 1 if metric == "return" else 100
+        numbers = summary.estimates[metric]
+        cells = [_cell(numbers.get(column), scale) for column in ("mean", "top", "top_heldout", "worst")]
+        if metric == METRICS[0]:
+            cells[-1] += f"\n{summary.worst}"
+        table.add_row(name if metric == METRICS[0] else "", LABELS[metric], *cells)
+    table.add_section()
 
 
 def _cell(estimate: Estimate | None, scale: int) -> str:

@@ -44,8 +44,8 @@ def fresh(task: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     embedded.mkdir(parents=True)
     ghns = [GHN(task.inputs, task.outputs, seed).state_dict() for seed in (0, 1)]
     stacked = {name: torch.stack([ghn[name] for ghn in ghns]).half().contiguous() for name in ghns[0]}
-    sizes = {"inputs": str(task.inputs), "outputs": str(task.outputs)}
-    save_file(stacked, embedded / "ghns.safetensors", {"task": task.name, "ghn_seeds": "[0, 1]", **sizes})
+    metadata = {"task": task.name, "inputs": task.inputs, "outputs": task.outputs, "ghn_seeds": [0, 1]}
+    save_file(stacked, embedded / "ghns.safetensors", {"nnit": json.dumps(metadata)})
     scores = {"success_once": 1.0, "success_at_end": 0.9, "return": 36.0, "episodes": 64, "kept": True}
     rows = [
         {"architecture": name, "ghn_seed": seed, "split": split, **scores}
