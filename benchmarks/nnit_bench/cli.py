@@ -91,6 +91,7 @@ def run(*, what: What = DEFAULT_WHAT, how: How = DEFAULT_HOW) -> None:
     from nnit_zoo import tasks
 
     task = tasks.get(what.task)
+    task.check_installed()
     methods = [name for text in what.method for name in text.split(",") if name]
     for name in methods:
         generator.get(name)  # a wrong name is told now, not after the work for the names before it

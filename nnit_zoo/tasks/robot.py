@@ -39,6 +39,10 @@ class RobotPolicyTask(Task):
     def score(self, state: State) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Reward [n] in [0, 1] and success [n] of each state."""
 
+    def check_installed(self) -> None:
+        """Raise UserError if the simulator is not installed."""
+        require_simulator()
+
     def evaluate(
         self,
         policies: Sequence[PolicyBatch],
@@ -49,7 +53,7 @@ class RobotPolicyTask(Task):
     ) -> pa.Table:
         """One row of EPISODE_SCHEMA per policy and seed: a function of task, weights and seed alone."""
         self.check(policies, seeds)
-        require_simulator()
+        self.check_installed()
         names = [str(batch.architecture) for batch in policies for _ in range(len(batch))]
         finite = np.concatenate([batch.finite().numpy() for batch in policies])
         count = len(seeds)

@@ -74,6 +74,10 @@ class Task(ABC):
                     f"but these policies take {shape.inputs} to {shape.outputs}"
                 )
 
+    def check_installed(self) -> None:
+        """Raise UserError if something that scoring needs is not installed; most tasks need nothing more."""
+        return
+
     @abstractmethod
     def evaluate(
         self,
