@@ -1,0 +1,1 @@
+"""Generators of network weights, learned and control, behind one interface."""

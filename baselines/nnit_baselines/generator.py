@@ -1,0 +1,239 @@
+"""What a generator of networks is, where it is found by name, and how its checkpoint is stored."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import safetensors.torch
+from huggingface_hub import HfApi, snapshot_download
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+from safetensors import SafetensorError
+from torch import Tensor
+
+from nnit_zoo.architecture import Architecture
+from nnit_zoo.build.files import write_atomically, write_json
+from nnit_zoo.errors import UserError, unknown_name
+from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.zoo import TrainingView, Zoo
+
+BUILT_IN = {
+    "nnit": "nnit_baselines.nnit.generator:NNiT",
+    "crop": "nnit_baselines.controls.crop:Crop",
+    "ghn-oracle": "nnit_baselines.controls.ghn_oracle:GHNOracle",
+}
+ENTRY_POINTS = "nnit.generators"
+CHECKPOINTS = Path(__file__).parent / "checkpoints"
+CONFIG = "config.json"
+WEIGHTS = "model.safetensors"
+METADATA = {"format": "pt"}
+
+
+@dataclass(frozen=True)
+class SampleRequest:
+    """Wanted: `policies` networks of `architecture` (None = joint: the generator chooses), drawn with `seed`."""
+
+    architecture: Architecture | None
+    policies: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a generator declares that it can do; the harness asks before it runs."""
+
+    conditional: bool = True
+    """Samples networks of a requested architecture."""
+    joint: bool = False
+    """Samples architecture and weights together."""
+    checkpoint: bool = True
+    """Is trained beforehand and read from a checkpoint; otherwise `fit` takes no time and is called at every run."""
+    oracle: bool = False
+    """Is fitted on the reference policies of the evaluated split: an upper bound, not a method."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a `fit` runs; controls, which have nothing to train, ignore it."""
+
+    steps: int | None = None
+    """Optimiser steps; None = the method's own default."""
+    seed: int = 0
+    folder: Path | None = None
+    """Where the state to resume from and the log are kept; None = nowhere."""
+    progress: Callable[[int, int], None] | None = None
+    """Called with the steps done and the steps in all."""
+
+
+class Generator(ABC):
+    """A source of networks for one task: `fit` on a zoo's view, then `sample`.
+
+    It is made without arguments. A subclass with a checkpoint also says what to store (`config`, `tensors`) and how to
+    come back (`from_state`).
+    """
+
+    capabilities: ClassVar[Capabilities]
+
+    def __init__(self) -> None:
+        self.task = ""
+        """Name of the task that the networks solve; set by `fit`."""
+        self.training: dict[str, Any] = {}
+        """Facts about the training, kept in config.json."""
+
+    @abstractmethod
+    def fit(self, view: TrainingView, run: Run | None = None) -> None:
+        """Learn from the policies of a view; raises UserError for a reference view unless this is an oracle."""
+
+    @abstractmethod
+    def sample(self, request: SampleRequest) -> PolicyBatch:
+        """The requested networks, float32; the same request gives the same networks.
+
+        Raises UserError if this generator cannot make that architecture.
+        """
+
+    def config(self) -> dict[str, Any]:
+        """What config.json holds besides method, task and training: plain JSON values."""
+        raise UserError(f"{type(self).__name__} keeps no checkpoint: it is made from the zoo at every run")
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What model.safetensors holds."""
+        raise UserError(f"{type(self).__name__} keeps no checkpoint: it is made from the zoo at every run")
+
+    @classmethod
+    def from_state(cls, config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
+        """The generator that `config` and `tensors` describe; raises ValueError or KeyError if they do not fit."""
+        raise UserError(f"{cls.__name__} keeps no checkpoint: it is made from the zoo at every run")
+
+    def save_pretrained(self, folder: Path | str) -> None:
+        """Write config.json and model.safetensors, the Hub's convention, into `folder`."""
+        folder = Path(folder)
+        config = {"method": type(self).__name__, "task": self.task, **self.config(), "training": self.training}
+        tensors = self.tensors()
+        write_atomically(folder / WEIGHTS, lambda path: safetensors.torch.save_file(tensors, path, METADATA))
+        write_json(folder / CONFIG, config)
+
+    @classmethod
+    def from_pretrained(cls, source: Path | str, task: str | None = None) -> Self:
+        """The generator stored in a folder, or in a repository of the Hub by its id.
+
+        Raises UserError if there is none, if it is damaged or another method's, or if it is for another task than
+        `task`.
+        """
+        folder = _fetch(source)
+        try:
+            config = json.loads((folder / CONFIG).read_text())
+            if config["method"] != cls.__name__:
+                raise UserError(f"the checkpoint in {source} is of {config['method']}, not of {cls.__name__}")
+            generator = cls.from_state(config, safetensors.torch.load_file(folder / WEIGHTS))
+            generator.task, generator.training = config["task"], config["training"]
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+            raise UserError(f"the checkpoint in {source} cannot be read: {error}") from None
+        if task is not None and generator.task != task:
+            raise UserError(f"the checkpoint in {source} is for {generator.task}, not for {task}")
+        return generator
+
+    def push_to_hub(self, repo_id: str) -> str:
+        """Upload the checkpoint to a model repository of the Hub, made if needed; returns the address of the commit."""
+        with tempfile.TemporaryDirectory() as folder:
+            self.save_pretrained(folder)
+            hub = HfApi()
+            hub.create_repo(repo_id, exist_ok=True)
+            return str(hub.upload_folder(repo_id=repo_id, folder_path=folder))
+
+
+def refuse_reference(view: TrainingView) -> None:
+    """Raise UserError if the view holds yardsticks, such as unseen architectures, instead of training data."""
+    if view.reference:
+        raise UserError("a reference view is never for training; use zoo.training_view()")
+
+
+def names() -> tuple[str, ...]:
+    """The names of all generators: built in, and installed under the entry-point group `nnit.generators`."""
+    return tuple(sorted({*BUILT_IN, *entry_points(group=ENTRY_POINTS).names}))
+
+
+def get(name: str) -> type[Generator]:
+    """The generator class with this name, or at `package.module:Class` or `path/to/file.py:Class`.
+
+    Raises UserError, with near names, if there is none.
+    """
+    if name in BUILT_IN:
+        return _load(BUILT_IN[name])
+    installed = entry_points(group=ENTRY_POINTS)
+    if name in installed.names:
+        return _load(installed[name].value)
+    if ":" in name:
+        return _load(name)
+    raise unknown_name("method", name, names())
+
+
+def checkpoint(name: str, task: str) -> Path | None:
+    """The folder of the checkpoint of this method and task that ships with the package, if there is one."""
+    folder = CHECKPOINTS / name / task
+    return folder if (folder / CONFIG).is_file() else None
+
+
+def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None) -> Generator:
+    """The generator called `name`, ready to sample networks of `split` for the zoo's task.
+
+    A trained method is read from `source`, by default from its shipped checkpoint; a control is fitted on the zoo.
+    Raises UserError if there is no checkpoint, or it is for another task.
+    """
+    kind = get(name)
+    if not kind.capabilities.checkpoint:
+        generator = kind()
+        generator.fit(zoo.reference_view(split) if kind.capabilities.oracle else zoo.training_view())
+        return generator
+    found = source or checkpoint(name, zoo.task)
+    if found is None:
+        raise UserError(
+            f"no checkpoint of {name} for {zoo.task} ships with nnit; "
+            f"train one with: nnit-bench train --method {name} --task {zoo.task}"
+        )
+    return kind.from_pretrained(found, zoo.task)
+
+
+def _load(address: str) -> type[Generator]:
+    """The class at `module:Class` or `file.py:Class`."""
+    place, _, attribute = address.rpartition(":")
+    try:
+        module = _run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
+    except (ImportError, OSError, SyntaxError) as error:
+        raise UserError(f"cannot load method '{address}': {error}") from None
+    found = getattr(module, attribute, None)
+    if found is None:
+        raise unknown_name(f"class in {place}", attribute, [name for name in vars(module) if name[0].isupper()])
+    if not (isinstance(found, type) and issubclass(found, Generator)):
+        raise UserError(f"'{address}' is not a subclass of nnit_baselines.generator.Generator")
+    return found
+
+
+def _run_file(path: Path) -> Any:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise UserError(f"no such file: {path}")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _fetch(source: Path | str) -> Path:
+    """The local folder of a checkpoint; what is not a folder is taken for a Hub id."""
+    if Path(source).is_dir():
+        return Path(source)
+    if isinstance(source, Path) or Path(source).is_absolute():
+        raise UserError(f"no checkpoint folder {source}")
+    try:
+        return Path(snapshot_download(source, allow_patterns=[CONFIG, WEIGHTS]))
+    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
+        raise UserError(
+            f"'{source}' is neither a folder nor a repository of the Hub that can be read: {error}"
+        ) from None

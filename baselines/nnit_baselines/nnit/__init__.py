@@ -1,0 +1,1 @@
+"""NNiT: a diffusion transformer over patches of weights, conditioned on the architecture (NNiT 5)."""

@@ -1,0 +1,180 @@
+"""The training loop of NNiT: resumable, and the same numbers whether it was interrupted or not."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from nnit_baselines import diffusion
+from nnit_baselines.generator import Run
+from nnit_baselines.nnit.config import NNiTConfig
+from nnit_baselines.nnit.model import Transformer
+from nnit_zoo.build.files import write_atomically
+from nnit_zoo.errors import UserError
+
+SAVE_SECONDS = 120.0
+LOG_STEPS = 50
+STATE = "state.pt"
+LOG = "log.jsonl"
+
+
+@dataclass(frozen=True)
+class Packed:
+    """All policies of one architecture as patches, with what the transformer needs to know of them."""
+
+    patches: Tensor
+    """[policies, L, p p], standardised."""
+    mask: Tensor
+    """[L, p p], whether an entry is a parameter."""
+    positions: Tensor
+    """[L, 3]."""
+    widths: Tensor
+    """[S]."""
+
+
+class Trainer:
+    """A model in training: the optimiser, the running mean of its weights, and how far it is."""
+
+    def __init__(self, model: Transformer, data: list[Packed], settings: NNiTConfig, seed: int) -> None:
+        self.model = model
+        self.data = data
+        self.settings = settings
+        self.seed = seed
+        self.step = 0
+        self.seconds = 0.0
+        betas = (0.9, settings.beta2)
+        self.optimiser = torch.optim.AdamW(model.parameters(), lr=0.0, betas=betas, weight_decay=0.0, fused=True)
+        self.mean = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(settings.ema))  # type: ignore[no-untyped-call]
+
+    def advance(self) -> float:
+        """One optimiser step; returns the loss."""
+        packed, chosen, generator = self.draw()
+        clean = packed.patches[chosen]
+        settings = self.settings
+        level = diffusion.noise_levels(len(clean), settings.level_mean, settings.level_std, generator)
+        noise = torch.randn(clean.shape, generator=generator) * packed.mask
+        noisy = diffusion.interpolate(clean, noise, level)
+        estimate = self.model(noisy, level, packed.positions, packed.widths)
+        loss = diffusion.loss(estimate, clean, level, packed.mask, settings.level_floor)
+        self.optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.rate()
+        self.optimiser.step()
+        self.mean.update_parameters(self.model)
+        self.step += 1
+        return loss.item()
+
+    def draw(self) -> tuple[Packed, Tensor, torch.Generator]:
+        """The architecture and policies of this step, and the generator for its noise.
+
+        A function of the seed and the step alone, so that a resumed training draws the same. Architectures come in a
+        new random order each round; a batch repeats no policy before it has all of the architecture.
+        """
+        round_, turn = divmod(self.step, len(self.data))
+        packed = self.data[int(np.random.default_rng([self.seed, 0, round_]).permutation(len(self.data))[turn])]
+        generator = torch.Generator()
+        generator.manual_seed(int(np.random.SeedSequence([self.seed, 1, self.step]).generate_state(1)[0]))
+        stored, wanted = len(packed.patches), self.settings.batch
+        orders = [torch.randperm(stored, generator=generator) for _ in range(-(-wanted // stored))]
+        return packed, torch.cat(orders)[:wanted], generator
+
+    def rate(self) -> float:
+        """The learning rate of this step."""
+        settings = self.settings
+        rise = min(1.0, (self.step + 1) / settings.warmup)
+        return settings.learning_rate * rise * (1 - self.step / settings.steps)
+
+    def identity(self) -> str:
+        """What must agree between a state and a training that goes on from it."""
+        policies = [len(packed.patches) for packed in self.data]
+        total = float(sum(packed.patches.double().sum() for packed in self.data))
+        return f"{self.settings.model_dump_json()} seed {self.seed} policies {policies} sum {total:.6f}"
+
+    def save(self, path: Path) -> None:
+        """Write the state, atomically."""
+        parts = {name: getattr(self, name).state_dict() for name in ("model", "optimiser", "mean")}
+        state = {**parts, "step": self.step, "seconds": self.seconds, "identity": self.identity()}
+        write_atomically(path, lambda temporary: torch.save(state, temporary))
+
+    def load(self, path: Path) -> None:
+        """Go on from a state; raises UserError if it is of another training."""
+        state = torch.load(path, weights_only=True)
+        if state["identity"] != self.identity():
+            raise UserError(
+                f"{path} is the state of a training with other settings, seed or data; "
+                "repeat those, or delete the file to start anew"
+            )
+        for name in ("model", "optimiser", "mean"):
+            getattr(self, name).load_state_dict(state[name])
+        self.step, self.seconds = state["step"], state["seconds"]
+
+
+def train(model: Transformer, data: list[Packed], settings: NNiTConfig, run: Run) -> dict[str, Any]:
+    """Train `model` in place, to the running mean of its weights; returns the facts for config.json."""
+    trainer = Trainer(model, data, settings, run.seed)
+    log = Log(run.folder)
+    if run.folder is not None:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        if (run.folder / STATE).is_file():
+            trainer.load(run.folder / STATE)
+        log.cut(trainer.step)
+    started, saved = time.monotonic() - trainer.seconds, time.monotonic()
+    losses: list[float] = []
+    while trainer.step < settings.steps:
+        losses.append(trainer.advance())
+        trainer.seconds = time.monotonic() - started
+        done = trainer.step == settings.steps
+        if trainer.step % LOG_STEPS == 0 or done:
+            log.add(trainer, losses)
+            losses = []
+        if run.folder is not None and (done or time.monotonic() - saved > SAVE_SECONDS):
+            trainer.save(run.folder / STATE)
+            saved = time.monotonic()
+        if run.progress is not None:
+            run.progress(trainer.step, settings.steps)
+    model.load_state_dict(trainer.mean.module.state_dict())
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    return {"steps": settings.steps, "seconds": round(trainer.seconds), "seed": run.seed, "parameters": parameters}
+
+
+class Log:
+    """One JSON line every LOG_STEPS steps: step, mean loss, learning rate, seconds, policies per second."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self.path = folder / LOG if folder is not None else None
+
+    def cut(self, step: int) -> None:
+        """Drop the lines after `step`, written by a run that was stopped before it saved them."""
+        if self.path is None or not self.path.is_file():
+            return
+        lines = self.path.read_text().splitlines(keepends=True)
+        kept = [line for line in lines if json.loads(line)["step"] <= step]
+
+        def write(temporary: Path) -> None:
+            temporary.write_text("".join(kept))
+
+        write_atomically(self.path, write)
+
+    def add(self, trainer: Trainer, losses: list[float]) -> None:
+        """Append the line of the last steps."""
+        if self.path is None:
+            return
+        line = {
+            "step": trainer.step,
+            "loss": sum(losses) / len(losses),
+            "learning_rate": trainer.rate(),
+            "seconds": round(trainer.seconds, 1),
+            "policies_per_second": round(trainer.step * trainer.settings.batch / trainer.seconds, 1),
+        }
+        with self.path.open("a") as file:
+            file.write(json.dumps(line) + "\n")

@@ -1,0 +1,87 @@
+"""Train a method on a zoo and write its checkpoint with a model card: what `nnit-bench train` does."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from pathlib import Path
+
+import torch
+
+import nnit_zoo
+from nnit_baselines.generator import Generator, Run, get
+from nnit_zoo.build.files import write_atomically
+from nnit_zoo.errors import UserError
+from nnit_zoo.files import MANIFEST, sha256_of
+
+CARD = """---
+license: apache-2.0
+library_name: nnit
+tags:
+- weight-generation
+- {task}
+---
+# {name} for {task}
+
+Generates the weights of small {task} policies for a requested architecture. Trained on the policies of seen
+architectures and training seeds of the `nnit` zoo.
+
+```python
+from nnit_baselines.generator import SampleRequest, get
+from nnit_zoo.architecture import Architecture
+
+generator = get("{method}").from_pretrained("FOLDER_OR_HUB_ID")
+policies = generator.sample(SampleRequest(Architecture.parse("16-64-64-32", {inputs}, {outputs}), policies=10, seed=0))
+```
+
+| Training | |
+|---|---|
+{facts}
+"""
+
+
+def train(method: str, task: str, run: Run, output: Path, zoo_folder: Path | None = None) -> Generator:
+    """Fit `method` on the task's training view and write config.json, model.safetensors and README.md to `output`.
+
+    An interrupted run goes on from `run.folder`. Raises UserError for an unknown method, one that needs no training,
+    or a missing zoo.
+    """
+    kind = get(method)
+    if not kind.capabilities.checkpoint:
+        raise UserError(f"{method} needs no training; run: nnit-bench run --method {method}")
+    zoo = nnit_zoo.load(task, zoo_folder)
+    view = zoo.training_view()
+    generator = kind()
+    generator.fit(view, run)
+    generator.training |= {
+        "policies": len(view),
+        "zoo_manifest_sha256": sha256_of(zoo.folder / MANIFEST),
+        "git_commit": git_commit(),
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+    }
+    generator.save_pretrained(output)
+    shape = view.architectures[0]
+    text = card(method, generator, shape.inputs, shape.outputs)
+
+    def write(path: Path) -> None:
+        path.write_text(text)
+
+    write_atomically(output / "README.md", write)
+    return generator
+
+
+def card(method: str, generator: Generator, inputs: int, outputs: int) -> str:
+    """The checkpoint's model card."""
+    facts = "\n".join(f"| {name.replace('_', ' ')} | {value} |" for name, value in generator.training.items())
+    name = type(generator).__name__
+    return CARD.format(name=name, method=method, task=generator.task, inputs=inputs, outputs=outputs, facts=facts)
+
+
+def git_commit() -> str:
+    """The commit of the code that runs, `-dirty` if it was changed since; `unknown` outside a repository."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--match="]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603 - fixed
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

@@ -1,0 +1,128 @@
+"""How generators are found, and how their checkpoints are stored."""
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from nnit_baselines import generator as generators
+from nnit_baselines.controls.crop import Crop
+from nnit_zoo.errors import UserError
+
+PLUGIN = """
+import torch
+from nnit_baselines.generator import Capabilities, Generator
+from nnit_zoo.policy import PolicyBatch
+
+class Constant(Generator):
+    capabilities = Capabilities()
+    value = 1.0
+
+    def fit(self, view, run=None):
+        self.task = view.task
+
+    def sample(self, request):
+        shapes = request.architecture.block_shapes
+        return PolicyBatch(request.architecture, tuple(torch.full((request.policies, *s), self.value) for s in shapes))
+
+    def config(self):
+        return {"value": self.value}
+
+    def tensors(self):
+        return {"unused": torch.zeros(1)}
+
+    @classmethod
+    def from_state(cls, config, tensors):
+        made = cls()
+        made.value = config["value"]
+        return made
+
+class Stranger:
+    pass
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path):
+    path = tmp_path / "plugin.py"
+    path.write_text(PLUGIN)
+    return path
+
+
+def test_built_in_names_lead_to_classes():
+    assert {"nnit", "crop", "ghn-oracle"} <= set(generators.names())
+    assert all(issubclass(generators.get(name), generators.Generator) for name in generators.BUILT_IN)
+
+
+def test_listing_names_imports_no_method():
+    sys.modules.pop("nnit_baselines.controls.ghn_oracle", None)
+    generators.names()
+    assert "nnit_baselines.controls.ghn_oracle" not in sys.modules
+
+
+def test_a_class_in_a_file_or_a_module_is_a_method(plugin, monkeypatch):
+    assert generators.get(f"{plugin}:Constant").__name__ == "Constant"
+    monkeypatch.syspath_prepend(plugin.parent)
+    assert generators.get("plugin:Constant").__name__ == "Constant"
+
+
+def test_an_installed_entry_point_is_a_method(plugin, monkeypatch):
+    folder = plugin.parent / "plugin-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[nnit.generators]\nconstant = plugin:Constant\n")
+    monkeypatch.syspath_prepend(plugin.parent)
+    assert "constant" in generators.names()
+    assert generators.get("constant").__name__ == "Constant"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nnitt", "did you mean nnit"),
+        ("no_such_module:Thing", "cannot load"),
+        ("no_such_file.py:Thing", "no such file"),
+        ("{plugin}:Constan", "did you mean Constant"),
+        ("{plugin}:Stranger", "not a subclass"),
+    ],
+)
+def test_a_wrong_method_gets_an_answer(name, message, plugin):
+    with pytest.raises(UserError, match=message):
+        generators.get(name.format(plugin=plugin))
+
+
+def test_a_checkpoint_comes_back_for_its_own_task_only(plugin, tmp_path):
+    kind = generators.get(f"{plugin}:Constant")
+    made = kind()
+    made.task, made.value, made.training = "Push", 2.5, {"steps": 3}
+    made.save_pretrained(tmp_path / "saved")
+    back = kind.from_pretrained(tmp_path / "saved", "Push")
+    assert (back.task, back.value, back.training) == ("Push", 2.5, {"steps": 3})
+    with pytest.raises(UserError, match="is for Push, not for Pick"):
+        kind.from_pretrained(tmp_path / "saved", "Pick")
+    with pytest.raises(UserError, match="is of Constant, not of NNiT"):
+        generators.get("nnit").from_pretrained(tmp_path / "saved")
+
+
+def test_a_missing_or_damaged_checkpoint_gets_an_answer(plugin, tmp_path):
+    kind = generators.get(f"{plugin}:Constant")
+    with pytest.raises(UserError, match="no checkpoint folder"):
+        kind.from_pretrained(tmp_path / "nowhere")
+    kind().save_pretrained(tmp_path / "saved")
+    (tmp_path / "saved" / generators.WEIGHTS).write_bytes(b"half a fi")
+    with pytest.raises(UserError, match="cannot be read"):
+        kind.from_pretrained(tmp_path / "saved")
+
+
+def test_a_method_without_a_shipped_checkpoint_says_how_to_train_it(plugin):
+    zoo = SimpleNamespace(task="Push")
+    with pytest.raises(UserError, match=r"nnit-bench train --method .*Constant --task Push"):
+        generators.prepare(f"{plugin}:Constant", zoo, "unseen")
+
+
+def test_a_control_is_fitted_on_the_training_view_and_an_oracle_on_the_reference(view):
+    zoo = SimpleNamespace(task="Push", training_view=lambda: view, reference_view=lambda split: (split, view)[1])
+    assert generators.prepare("crop", zoo, "unseen").view is view
+    assert generators.prepare("ghn-oracle", zoo, "unseen").view is view
+    with pytest.raises(UserError, match="keeps no checkpoint"):
+        Crop().save_pretrained("anywhere")
