@@ -117,8 +117,8 @@ def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow
         show_edge=False,
     )
     table.add_column("", overflow="fold")
-    table.add_column("")
-    for heading in ("mean", top, f"{top} held out", "worst arch."):
+    table.add_column("", no_wrap=True)
+    for heading in ("mean", top, "held out", "worst arch."):
         table.add_column(heading, justify="right")
     for outcome in outcomes:
         _add(table, outcome.record.method.name.rpartition("/")[2], outcome.summary)
@@ -127,7 +127,8 @@ def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow
     console = Console(file=sys.stdout, highlight=False, markup=False)
     console.print(table, end="\n\n")
     console.print(
-        f"Below each number its 95 % interval. {top}: chosen and scored on the same episodes; held out: on others."
+        f"Below each number its 95 % interval. {top}: chosen and scored on the same episodes; held out: the same "
+        f"{protocol.top} policies on others."
     )
     if zoo_row:
         console.print(
