@@ -101,23 +101,16 @@ class _Lines:
             self._last = now
 
 
-LABELS = {"success_at_end": "success at end, %", "success_once": "success once, %", "return": "return"}
+LABELS = {"success_at_end": "at end, %", "success_once": "once, %", "return": "return"}
 
 
 def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow | None) -> None:
     """Print the result table on stdout: a row per method and score, and the zoo's own."""
     policies, architectures = sum(protocol.policies.values()), len(protocol.policies)
     top = f"top-{protocol.top}"
-    table = Table(
-        title=f"{protocol.task}, {protocol.split}: {policies} policies, {architectures} architectures, "
-        f"{protocol.episodes} episodes per policy\n",
-        title_justify="left",
-        box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        show_edge=False,
-    )
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     table.add_column("", overflow="fold")
-    table.add_column("", no_wrap=True)
+    table.add_column("success", no_wrap=True)
     for heading in ("mean", top, "held out", "worst arch."):
         table.add_column(heading, justify="right")
     for outcome in outcomes:
@@ -125,6 +118,10 @@ def print_table(protocol: Protocol, outcomes: Sequence[Outcome], zoo_row: ZooRow
     if zoo_row:
         _add(table, "zoo *", zoo_row.summary)
     console = Console(file=sys.stdout, highlight=False, markup=False)
+    console.print(
+        f"{protocol.task}, {protocol.split}: {policies} policies, {architectures} architectures, "
+        f"{protocol.episodes} episodes per policy\n"
+    )
     console.print(table, end="\n\n")
     console.print(
         f"Below each number its 95 % interval. {top}: chosen and scored on the same episodes; held out: the same "
