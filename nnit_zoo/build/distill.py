@@ -1,6 +1,6 @@
 """From expert to GHNs: DAgger gathers a buffer of states once, then every seed's GHN regresses onto the expert there.
 
-NNiT appendix C distils each GHN with DAgger of its own; a shared buffer costs a sixth of that on a CPU
+NNiT appendix C distils each GHN with DAgger of its own; a shared buffer costs far less on a CPU
 (docs/deviations.md), and every zoo's record says that it was used.
 """
 
@@ -54,7 +54,7 @@ class Regression:
     """Fits a GHN, on architectures drawn at random from the seen ones, to labelled states.
 
     Each block gets Gaussian noise of `weight_noise` times its root mean square: policies then survive weight errors of
-    a few per cent, without which no generated policy works.
+    a few per cent, which generated policies have.
     """
 
     def __init__(self, ghn: GHN, config: DistillConfig, seed: int) -> None:

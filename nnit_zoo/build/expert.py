@@ -23,6 +23,7 @@ from nnit_zoo.tasks.robot import RobotPolicyTask
 
 TRAINING_SEEDS = 100_000_000  # episode seeds of training count up from here
 EVALUATION_SEEDS = range(90_000_000, 90_000_200)
+UNIT = 32  # training episodes that a worker plays in lockstep
 
 Network = list[tuple[Array, Array]]  # (weight [out, in], bias [out]) of each layer
 
@@ -122,7 +123,7 @@ def play(task: RobotPolicyTask, network: Network, seeds: range, noise: tuple[Arr
     return rollout(task, seeds, act)
 
 
-def evaluate(task: RobotPolicyTask, network: Network, pool: Any, workers: int, seeds: range) -> list[Episodes]:
+def evaluate(task: RobotPolicyTask, network: Network, pool: Any, seeds: range) -> list[Episodes]:
     """Deterministic episodes of the expert over seeds, shared out to the pool's workers."""
     from joblib import delayed  # noqa: PLC0415  part of the simulator's extra
 
@@ -168,19 +169,18 @@ class Training:
         self.generator.set_state(state["generator"])
         self.iteration, self.best_return = state["iteration"], state["best_return"]
 
-    def iterate(self, pool: Any, workers: int) -> float:
+    def iterate(self, pool: Any) -> float:
         """Roll out one episode per environment, update, and return the mean undiscounted return."""
         from joblib import delayed  # noqa: PLC0415  part of the simulator's extra
 
         config = self.config
         network = network_of(self.model.actor)
         std = self.model.log_std.detach().exp().numpy()
-        share = config.environments // workers
         first = TRAINING_SEEDS + self.iteration * config.environments
-        jobs = []
-        for worker in range(workers):
-            seeds = range(first + worker * share, first + (worker + 1) * share)
-            jobs.append(delayed(play)(self.task, network, seeds, (std, first + worker)))
+        seeds = range(first, first + config.environments)
+        # Units of a fixed size, each with noise of its own: the number of workers changes no number.
+        units = [seeds[start : start + UNIT] for start in range(0, len(seeds), UNIT)]
+        jobs = [delayed(play)(self.task, network, unit, (std, first + index)) for index, unit in enumerate(units)]
         episodes = pool(jobs)
         observations = torch.from_numpy(np.concatenate([part.observations for part in episodes], axis=1))
         actions = torch.from_numpy(np.concatenate([part.actions for part in episodes], axis=1))
@@ -245,10 +245,10 @@ def train(
     with Parallel(n_jobs=workers) as pool:
         while training.steps < config.total_steps and not good_enough(config, record):
             started = time.monotonic()
-            mean_return = training.iterate(pool, workers)
+            mean_return = training.iterate(pool)
             if training.iteration % config.evaluate_every:
                 continue
-            scores = summarise(evaluate(task, network_of(training.model.actor), pool, workers, EVALUATION_SEEDS))
+            scores = summarise(evaluate(task, network_of(training.model.actor), pool, EVALUATION_SEEDS))
             entry = {"steps": training.steps, "training_return": mean_return, **scores}
             log(f"expert {json.dumps(entry)} ({time.monotonic() - started:.1f} s)")
             with (folder / "log.jsonl").open("a") as lines:

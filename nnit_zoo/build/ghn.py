@@ -18,7 +18,7 @@ from nnit_zoo.policy import PolicyBatch
 
 CANVAS = 64  # largest width that the decoder can emit
 _WIDTH = 32  # of a node's embedding, and channels of the first feature map
-_START_STD = 0.6  # of the raw canvas at the start: every seed trained; at 1.0 two in three were lost
+_START_STD = 0.6  # of the raw canvas at the start; with it every seed trained
 
 
 class GHN(nn.Module):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby, islice
@@ -113,7 +112,6 @@ def _units(
 
 
 def _score(task: RobotPolicyTask, unit: list[_Job]) -> _Scores:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     rows, networks, seeds = zip(*unit, strict=True)
     controller = Controller(networks, task.observation_mean, task.observation_std)
     episodes = rollout(task, seeds, controller)
