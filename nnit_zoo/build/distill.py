@@ -1,13 +1,14 @@
-"""From expert to GHNs: DAgger gathers a buffer of states once, then every seed's GHN regresses onto the expert there.
+"""From expert to GHNs: DAgger gathers a buffer of states once; every seed's GHN starts from it and adds its own.
 
-NNiT appendix C distils each GHN with DAgger of its own; a shared buffer costs far less on a CPU
-(docs/deviations.md), and every zoo's record says that it was used.
+NNiT appendix C distils each GHN with DAgger of its own. A shared buffer costs far less on a CPU (docs/deviations.md);
+a few on-policy rounds then show each GHN the states that its own policies reach. The record says which came from where.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from nnit_zoo.sim.tabletop import Array
 from nnit_zoo.tasks.robot import RobotPolicyTask
 
 COLLECTION_SEEDS = 200_000_000  # episode seeds of DAgger count up from here
+OWN_SEEDS = 300_000_000  # those of a GHN's own rounds count up from here
+_SEEDS_PER_GHN = 10_000
 COLLECTOR = 1_000_000  # seed of the GHN that gathers the buffer; it is in no zoo
 
 
@@ -44,6 +47,11 @@ class DistillConfig(BaseModel):
     round_steps: int = 250
     round_learning_rate: float = 2e-3
     steps: int = 1500
+    own_rounds: int = 2
+    """Times, evenly spread over the steps, that a GHN's own policies play, with the weight noise of training."""
+    own_episodes: int = 50
+    own_share: float = 0.25
+    """Of the states in a batch, once there are states of the GHN's own."""
     learning_rate: float = 3e-3
     architectures_per_step: int = 8
     states_per_architecture: int = 256
@@ -62,16 +70,25 @@ class Regression:
         self.seen = architectures("seen", ghn.inputs, ghn.outputs)
         self.generator = torch.Generator().manual_seed(seed)
 
-    def run(self, states: Tensor, labels: Tensor, steps: int, optimizer: Any, schedule: Any = None) -> float:
-        """Take steps on standardised states [s, inputs] and labels [s, outputs]; returns the last losses' mean."""
+    def run(
+        self, states: Tensor, labels: Tensor, steps: int, optimizer: Any, schedule: Any = None, *, own: int = 0
+    ) -> float:
+        """Take steps on standardised states [s, inputs] and labels [s, outputs]; returns the last losses' mean.
+
+        The last `own` states are the GHN's own: they get their share of every batch.
+        """
         config, draw = self.config, self.generator
+        from_own = int(config.own_share * config.states_per_architecture) if own else 0
+        shared, from_shared = len(states) - own, config.states_per_architecture - from_own
         recent: list[float] = []
         for _ in range(steps):
             chosen = torch.randperm(len(self.seen), generator=draw)[: config.architectures_per_step].tolist()
             networks = self.ghn([self.seen[index] for index in chosen])
             loss = torch.zeros(())
             for blocks in networks:
-                rows = torch.randint(len(states), (config.states_per_architecture,), generator=draw)
+                rows = torch.randint(shared, (from_shared,), generator=draw)
+                if own:
+                    rows = torch.cat([rows, torch.randint(shared, len(states), (from_own,), generator=draw)])
                 loss = loss + nn.functional.mse_loss(self._noisy_forward(blocks, states[rows]), labels[rows])
             optimizer.zero_grad()
             (loss / len(networks)).backward()  # type: ignore[no-untyped-call]
@@ -82,11 +99,15 @@ class Regression:
             recent = [*recent[-49:], float(loss.detach()) / len(networks)]
         return sum(recent) / len(recent)
 
+    def noisy(self, block: Tensor) -> Tensor:
+        """The block with the training's weight noise."""
+        scale = self.config.weight_noise * block.detach().square().mean().sqrt()
+        return block + scale * torch.randn(block.shape, generator=self.generator)
+
     def _noisy_forward(self, blocks: Sequence[Tensor], states: Tensor) -> Tensor:
         hidden = states
         for level, block in enumerate(blocks):
-            scale = self.config.weight_noise * block.detach().square().mean().sqrt()
-            noisy = block + scale * torch.randn(block.shape, generator=self.generator)
+            noisy = self.noisy(block)
             hidden = nn.functional.linear(hidden, noisy[:, :-1], noisy[:, -1])
             if level < len(blocks) - 1:
                 hidden = hidden.tanh()
@@ -185,14 +206,35 @@ def labelled(task: RobotPolicyTask, network: experts.Network, observations: Arra
 def train_ghn(
     task: RobotPolicyTask, config: DistillConfig, network: experts.Network, states: Path, target: Path, seed: int
 ) -> str:
-    """Train one seed's GHN on the buffer and store its state as float16 safetensors; returns a log line."""
+    """Train one seed's GHN on the buffer and its own rounds; stores its state as float16 safetensors; a log line."""
     torch.set_num_threads(1)
     inputs, labels = labelled(task, network, load_arrays(states)["states"])
+    shared = len(inputs)
     ghn = GHN(task.inputs, task.outputs, seed)
+    ghn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster
+    regression = Regression(ghn, config, seed)
     optimizer = torch.optim.AdamW(ghn.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=config.steps)
-    loss = Regression(ghn, config, seed).run(inputs, labels, config.steps, optimizer, schedule)
-    state = {name: tensor.half() for name, tensor in ghn.state_dict().items()}
-    note = {"seed": str(seed), "loss": json.dumps(loss)}
+    bounds = np.linspace(0, config.steps, config.own_rounds + 2).astype(int)
+    loss = 0.0
+    for round_, (start, stop) in enumerate(pairwise(bounds)):
+        if round_:
+            first = OWN_SEEDS + seed * _SEEDS_PER_GHN + (round_ - 1) * config.own_episodes
+            own = _own_states(task, regression, range(first, first + config.own_episodes))
+            more = labelled(task, network, own)
+            inputs, labels = torch.cat([inputs, more[0]]), torch.cat([labels, more[1]])
+        loss = regression.run(inputs, labels, int(stop - start), optimizer, schedule, own=len(inputs) - shared)
+    state = {name: tensor.half().contiguous() for name, tensor in ghn.state_dict().items()}
+    note = {"seed": str(seed), "loss": json.dumps(loss), "own_states": str(len(inputs) - shared)}
     write_atomically(target, lambda temporary: save_file(state, temporary, note))
     return f"GHN {seed}: loss {loss:.4f}"
+
+
+def _own_states(task: RobotPolicyTask, regression: Regression, seeds: range) -> Array:
+    """Raw observations [len(seeds) * steps, inputs] of episodes played by the GHN's own policies, weights noisy."""
+    students = [
+        [regression.noisy(torch.from_numpy(block)).numpy() for block in network]
+        for network in _students(regression.ghn, regression, len(seeds))
+    ]
+    controller = Controller(students, task.observation_mean, task.observation_std)
+    return rollout(task, seeds, controller).observations[:-1].reshape(-1, task.inputs)

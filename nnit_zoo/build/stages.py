@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,6 +34,7 @@ from nnit_zoo.policy import concatenate
 from nnit_zoo.sim.tabletop import require_simulator
 from nnit_zoo.tasks.robot import RobotPolicyTask
 from nnit_zoo.tasks.task import data_folder
+from nnit_zoo.zoo import HELDOUT_SEEDS_FROM
 
 Stage = Literal["all", "expert", "states", "ghns", "scores", "pack"]
 STAGES = ("expert", "states", "ghns", "scores", "pack")
@@ -170,7 +171,7 @@ class Builder:
             lambda temporary: pq.write_table(pa.Table.from_pylist(rows), temporary, compression="zstd"),
         )
         write_manifest(self.data)
-        seen = [row for row in rows if row["split"] == "seen"]
+        seen = [row for row in rows if row["split"] == "seen" and row["ghn_seed"] < HELDOUT_SEEDS_FROM]
         passed = sum(row["kept"] for row in seen)
         self._record(scores={"episodes": len(SCORING_SEEDS), "seeds_from": SCORING_SEEDS.start, "commit": _commit()})
         log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass")
@@ -204,7 +205,8 @@ def select(task: RobotPolicyTask, split: str, architecture: str, scores: pa.Tabl
     """The selection rows of one architecture's candidates, by GHN seed.
 
     Of a seen architecture, the best 100 that reach both thresholds are kept, by success at the end, then return (NNiT
-    appendix C). Of a reference architecture all are kept: they are a yardstick, which a filter would bend.
+    appendix C). Of a reference architecture, and of held-out seeds, all are kept: they are a yardstick, which a filter
+    would bend.
     """
     means = scores.group_by("ghn_seed").aggregate(
         [("success_once", "mean"), ("success_at_end", "mean"), ("return", "mean"), ("seed", "count")]
@@ -212,14 +214,14 @@ def select(task: RobotPolicyTask, split: str, architecture: str, scores: pa.Tabl
     candidates = sorted(
         means.to_pylist(), key=lambda row: (-row["success_at_end_mean"], -row["return_mean"], row["ghn_seed"])
     )
-    kept: Sequence[int] = [
+    reference = [row["ghn_seed"] for row in candidates if split != "seen" or row["ghn_seed"] >= HELDOUT_SEEDS_FROM]
+    passing = [
         row["ghn_seed"]
         for row in candidates
-        if split != "seen"
-        or (row["success_at_end_mean"] >= task.success_threshold and row["return_mean"] >= task.return_threshold)
+        if row["success_at_end_mean"] >= task.success_threshold and row["return_mean"] >= task.return_threshold
     ]
-    if split == "seen":
-        kept = kept[:POLICIES_PER_ARCHITECTURE]
+    corpus = [seed for seed in passing if seed not in reference][:POLICIES_PER_ARCHITECTURE]
+    kept = {*reference, *corpus}
     for row in sorted(candidates, key=lambda row: row["ghn_seed"]):
         yield {
             "architecture": architecture,
