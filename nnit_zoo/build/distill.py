@@ -52,9 +52,9 @@ class DistillConfig(BaseModel):
     own_episodes: int = 50
     own_share: float = 0.25
     """Of the states in a batch, once there are states of the GHN's own."""
-    learning_rate: float = 3e-3
-    architectures_per_step: int = 8
-    states_per_architecture: int = 256
+    learning_rate: float = 4e-3
+    architectures_per_step: int = 3
+    states_per_architecture: int = 512
     weight_noise: float = 0.05
 
 
