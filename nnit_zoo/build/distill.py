@@ -6,23 +6,20 @@ a few on-policy rounds then show each GHN the states that its own policies reach
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict
 from safetensors.numpy import load_file as load_arrays
 from safetensors.numpy import save_file as save_arrays
-from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
-from nnit_zoo.architecture import Architecture, architectures
+from nnit_zoo.architecture import Architecture
+from nnit_zoo.atomic import write_atomically
 from nnit_zoo.build import expert as experts
-from nnit_zoo.build.files import write_atomically
+from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
 from nnit_zoo.build.ghn import GHN
 from nnit_zoo.sim.control import Controller
 from nnit_zoo.sim.rollout import rollout
@@ -35,10 +32,8 @@ _SEEDS_PER_GHN = 10_000
 COLLECTOR = 1_000_000  # seed of the GHN that gathers the buffer; it is in no zoo
 
 
-class DistillConfig(BaseModel):
+class DistillConfig(FitConfig):
     """Settings of the buffer's DAgger rounds and of each GHN's regression."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rounds: int = 10
     episodes_per_round: int = 750
@@ -51,67 +46,10 @@ class DistillConfig(BaseModel):
     """Times, evenly spread over the steps, that a GHN's own policies play, with the weight noise of training."""
     own_episodes: int = 50
     own_share: float = 0.25
-    """Of the states in a batch, once there are states of the GHN's own."""
     learning_rate: float = 4e-3
     architectures_per_step: int = 3
     states_per_architecture: int = 512
     weight_noise: float = 0.05
-
-
-class Regression:
-    """Fits a GHN, on architectures drawn at random from the seen ones, to labelled states.
-
-    Each block gets Gaussian noise of `weight_noise` times its root mean square: policies then survive weight errors of
-    a few per cent, which generated policies have.
-    """
-
-    def __init__(self, ghn: GHN, config: DistillConfig, seed: int) -> None:
-        self.ghn, self.config = ghn, config
-        self.seen = architectures("seen", ghn.inputs, ghn.outputs)
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def run(
-        self, states: Tensor, labels: Tensor, steps: int, optimizer: Any, schedule: Any = None, *, own: int = 0
-    ) -> float:
-        """Take steps on standardised states [s, inputs] and labels [s, outputs]; returns the last losses' mean.
-
-        The last `own` states are the GHN's own: they get their share of every batch.
-        """
-        config, draw = self.config, self.generator
-        from_own = int(config.own_share * config.states_per_architecture) if own else 0
-        shared, from_shared = len(states) - own, config.states_per_architecture - from_own
-        recent: list[float] = []
-        for _ in range(steps):
-            chosen = torch.randperm(len(self.seen), generator=draw)[: config.architectures_per_step].tolist()
-            networks = self.ghn([self.seen[index] for index in chosen])
-            loss = torch.zeros(())
-            for blocks in networks:
-                rows = torch.randint(shared, (from_shared,), generator=draw)
-                if own:
-                    rows = torch.cat([rows, torch.randint(shared, len(states), (from_own,), generator=draw)])
-                loss = loss + nn.functional.mse_loss(self._noisy_forward(blocks, states[rows]), labels[rows])
-            optimizer.zero_grad()
-            (loss / len(networks)).backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(self.ghn.parameters(), 1.0)
-            optimizer.step()
-            if schedule:
-                schedule.step()
-            recent = [*recent[-49:], float(loss.detach()) / len(networks)]
-        return sum(recent) / len(recent)
-
-    def noisy(self, block: Tensor) -> Tensor:
-        """The block with the training's weight noise."""
-        scale = self.config.weight_noise * block.detach().square().mean().sqrt()
-        return block + scale * torch.randn(block.shape, generator=self.generator)
-
-    def _noisy_forward(self, blocks: Sequence[Tensor], states: Tensor) -> Tensor:
-        hidden = states
-        for level, block in enumerate(blocks):
-            noisy = self.noisy(block)
-            hidden = nn.functional.linear(hidden, noisy[:, :-1], noisy[:, -1])
-            if level < len(blocks) - 1:
-                hidden = hidden.tanh()
-        return hidden
 
 
 def standardise(task: RobotPolicyTask, observations: Array) -> Array:
@@ -158,7 +96,7 @@ def gather_states(
     from joblib import Parallel, delayed  # noqa: PLC0415  part of the simulator's extra
 
     ghn = GHN(task.inputs, task.outputs, COLLECTOR)
-    regression = Regression(ghn, config, COLLECTOR)
+    fit = Fit(ghn, config, COLLECTOR)
     optimizer = torch.optim.AdamW(ghn.parameters(), lr=config.round_learning_rate)
     gathered: list[Array] = []
     with Parallel(n_jobs=workers) as pool:
@@ -166,7 +104,7 @@ def gather_states(
             first = COLLECTION_SEEDS + round_ * config.episodes_per_round
             seeds = range(first, first + config.episodes_per_round)
             chunks = [seeds[start : start + 50] for start in range(0, len(seeds), 50)]
-            students = [_students(ghn, regression, len(chunk)) if round_ else [] for chunk in chunks]
+            students = [_students(ghn, fit, len(chunk)) if round_ else [] for chunk in chunks]
             path = folder / f"round-{round_}.safetensors"
             if not path.exists():
                 beta = config.teacher_decay**round_
@@ -177,7 +115,7 @@ def gather_states(
                 _save_states(path, np.concatenate(pool(jobs)))
             gathered.append(load_arrays(path)["states"])
             inputs, labels = labelled(task, network, np.concatenate(gathered))
-            loss = regression.run(inputs, labels, config.round_steps, optimizer)
+            loss = fit.run(inputs, labels, config.round_steps, optimizer)
             log(f"states: round {round_ + 1} of {config.rounds}, {len(inputs):,} states, loss {loss:.4f}")
     _save_states(folder / "states.safetensors", np.concatenate(gathered))
 
@@ -186,15 +124,15 @@ def _save_states(path: Path, states: Array) -> None:
     write_atomically(path, lambda temporary: save_arrays({"states": states}, temporary))
 
 
-def _students(ghn: GHN, regression: Regression, count: int) -> list[list[Array]]:
+def _students(ghn: GHN, fit: Fit, count: int) -> list[list[Array]]:
     """The GHN's policies of `count` seen architectures drawn at random, as arrays."""
-    chosen = torch.randint(len(regression.seen), (count,), generator=regression.generator).tolist()
+    chosen = torch.randint(len(fit.seen), (count,), generator=fit.generator).tolist()
     cache: dict[Architecture, list[Array]] = {}
     for index in chosen:
-        architecture = regression.seen[index]
+        architecture = fit.seen[index]
         if architecture not in cache:
             cache[architecture] = [layer[0].numpy() for layer in ghn.emit(architecture).layers]
-    return [cache[regression.seen[index]] for index in chosen]
+    return [cache[fit.seen[index]] for index in chosen]
 
 
 def labelled(task: RobotPolicyTask, network: experts.Network, observations: Array) -> tuple[Tensor, Tensor]:
@@ -212,7 +150,7 @@ def train_ghn(
     shared = len(inputs)
     ghn = GHN(task.inputs, task.outputs, seed)
     ghn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster
-    regression = Regression(ghn, config, seed)
+    fit = Fit(ghn, config, seed)
     optimizer = torch.optim.AdamW(ghn.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=config.steps)
     bounds = np.linspace(0, config.steps, config.own_rounds + 2).astype(int)
@@ -220,21 +158,18 @@ def train_ghn(
     for round_, (start, stop) in enumerate(pairwise(bounds)):
         if round_:
             first = OWN_SEEDS + seed * _SEEDS_PER_GHN + (round_ - 1) * config.own_episodes
-            own = _own_states(task, regression, range(first, first + config.own_episodes))
+            own = _own_states(task, fit, range(first, first + config.own_episodes))
             more = labelled(task, network, own)
             inputs, labels = torch.cat([inputs, more[0]]), torch.cat([labels, more[1]])
-        loss = regression.run(inputs, labels, int(stop - start), optimizer, schedule, own=len(inputs) - shared)
-    state = {name: tensor.half().contiguous() for name, tensor in ghn.state_dict().items()}
-    note = {"seed": str(seed), "loss": json.dumps(loss), "own_states": str(len(inputs) - shared)}
-    write_atomically(target, lambda temporary: save_file(state, temporary, note))
-    return f"GHN {seed}: loss {loss:.4f}"
+        loss = fit.run(inputs, labels, int(stop - start), optimizer, schedule, own=len(inputs) - shared)
+    return save_ghn(ghn, target, seed=seed, loss=loss, own_states=len(inputs) - shared)
 
 
-def _own_states(task: RobotPolicyTask, regression: Regression, seeds: range) -> Array:
+def _own_states(task: RobotPolicyTask, fit: Fit, seeds: range) -> Array:
     """Raw observations [len(seeds) * steps, inputs] of episodes played by the GHN's own policies, weights noisy."""
     students = [
-        [regression.noisy(torch.from_numpy(block)).numpy() for block in network]
-        for network in _students(regression.ghn, regression, len(seeds))
+        [fit.noisy(torch.from_numpy(block)).numpy() for block in network]
+        for network in _students(fit.ghn, fit, len(seeds))
     ]
     controller = Controller(students, task.observation_mean, task.observation_std)
     return rollout(task, seeds, controller).observations[:-1].reshape(-1, task.inputs)

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from nnit_zoo.build.files import write_atomically, write_json
+from nnit_zoo.atomic import write_atomically, write_json
 from nnit_zoo.sim.rollout import Episodes, rollout
 from nnit_zoo.sim.tabletop import Array
 from nnit_zoo.tasks.robot import RobotPolicyTask

@@ -1,4 +1,6 @@
-"""`nnit-zoo build`: expert, states, ghns, scores, pack, each resumable; a killed build goes on where it stopped.
+"""`nnit-zoo build`: its stages, each resumable; a killed build goes on where it stopped.
+
+Robot tasks: expert, states, ghns, scores, pack. MNIST-PCA32: features, ghns, scores, pack.
 
 Intermediate states go to the work folder, finished artifacts to the package's data folder of the task.
 """
@@ -6,11 +8,14 @@ Intermediate states go to the work folder, finished artifacts to the package's d
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -22,25 +27,38 @@ from safetensors.torch import load_file, save_file
 
 from nnit_zoo import tasks
 from nnit_zoo.architecture import SPLITS, Architecture, architectures
-from nnit_zoo.build import distill
+from nnit_zoo.atomic import write_atomically, write_json
+from nnit_zoo.build import distill, mnist
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
-from nnit_zoo.build.files import write_atomically, write_json
 from nnit_zoo.build.ghn import GHN
+from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
 from nnit_zoo.materialise import stored, write_manifest
+from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.policy import concatenate
 from nnit_zoo.sim.tabletop import require_simulator
+from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.robot import RobotPolicyTask
-from nnit_zoo.tasks.task import data_folder
+from nnit_zoo.tasks.task import Task, data_folder
 from nnit_zoo.zoo import HELDOUT_SEEDS_FROM
 
-Stage = Literal["all", "expert", "states", "ghns", "scores", "pack"]
-STAGES = ("expert", "states", "ghns", "scores", "pack")
-SCORING_SEEDS = range(10_000_000, 10_000_064)  # NNiT appendix C: 64 episodes a candidate
+Stage = Literal["all", "expert", "states", "features", "ghns", "scores", "pack"]
 POLICIES_PER_ARCHITECTURE = 100
 STD_FLOOR = 0.05  # keeps near-constant observations from being blown up; decides the weight error policies survive
+SELECTION_SCHEMA = pa.schema(
+    [
+        ("architecture", pa.string()),
+        ("ghn_seed", pa.int64()),
+        ("split", pa.string()),
+        ("success_once", pa.float64()),
+        ("success_at_end", pa.float64()),
+        ("return", pa.float64()),
+        ("episodes", pa.int64()),
+        ("kept", pa.bool_()),
+    ]
+)
 
 
 def build(
@@ -49,21 +67,33 @@ def build(
     stage: Stage = "all",
     seeds: int = 16,
     workers: int = 2,
+    parallel: Annotated[
+        Backend, Parameter(help="Where candidates are scored: on this machine, or on a Ray cluster.")
+    ] = "processes",
     work: Annotated[Path, Parameter(help="Folder of intermediate states; a killed build resumes from it.")] = Path(
         "runs/build"
     ),
+    source: Annotated[
+        str | None, Parameter(help="MNIST-PCA32's digits: a folder with the original IDX files, or ylecun/mnist.")
+    ] = None,
 ) -> None:
-    """Build a task's zoo: train the expert, distil one GHN per seed, score every candidate, pack what passes.
+    """Build a task's zoo: what its GHNs learn from, one GHN per seed, every candidate's scores, and those that pass.
 
     Run it again after a kill, at any moment, and it goes on. With `--stage`, only that stage.
     """
-    require_simulator()
     torch.set_num_threads(1)
     chosen = tasks.get(task)
-    if not isinstance(chosen, RobotPolicyTask):
-        raise UserError(f"{task} cannot be built by this command yet")
-    builder = Builder(chosen, work / task, seeds, workers)
-    for name in STAGES:
+    builder: Builder
+    if isinstance(chosen, RobotPolicyTask) and source is None:
+        require_simulator()
+        builder = RobotBuilder(chosen, work / task, seeds, workers, parallel)
+    elif isinstance(chosen, MNISTPCA32):
+        builder = MNISTBuilder(chosen, work / task, seeds, workers, source)
+    else:
+        raise UserError(f"--source is not for {task}" if source else f"this command cannot build {task}")
+    if stage not in ("all", *builder.stages):
+        raise UserError(f"building {task} has no stage '{stage}': there are {', '.join(builder.stages)}")
+    for name in builder.stages:
         if stage in ("all", name):
             getattr(builder, name)()
 
@@ -73,13 +103,121 @@ def log(message: str) -> None:
     print(message, file=sys.stderr, flush=True)  # noqa: T201
 
 
-class Builder:
-    """The stages of one task's build over GHN seeds 0 .. `seeds` - 1."""
+class Builder(ABC):
+    """The stages of one task's build over GHN seeds 0 .. `seeds` - 1; the last three are the same for all tasks."""
 
-    def __init__(self, task: RobotPolicyTask, work: Path, seeds: int, workers: int) -> None:
-        self.task, self.work, self.workers = task, work, workers
+    stages: ClassVar[tuple[str, ...]]
+
+    def __init__(self, task: Task, work: Path, seeds: int, workers: int, parallel: Backend = "processes") -> None:
+        self.task, self.work, self.workers, self.parallel = task, work, workers, parallel
         self.seeds = range(seeds)
         self.data = data_folder(task.name)
+
+    @abstractmethod
+    def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
+        """What trains the GHN of a seed into a file and returns a log line, and how, for the zoo's record."""
+
+    def ghns(self) -> None:
+        """Train one GHN per seed, then stack them all into the data folder."""
+        train, record = self.training()
+        missing = [seed for seed in self.seeds if not self._ghn(seed).exists()]
+        with Display(quiet=False).stage("ghns", len(missing)) as advance:
+            for _, line in unordered(lambda seed: train(self._ghn(seed), seed), missing, self.workers):
+                log(f"ghns: {line}")
+                advance(1)
+        states = [load_file(self._ghn(seed)) for seed in self.seeds]
+        stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
+        sizes = {"inputs": self.task.inputs, "outputs": self.task.outputs}
+        # One entry, because safetensors writes several in an order that changes from run to run.
+        note = {"nnit": json.dumps({"task": self.task.name, **sizes, "ghn_seeds": list(self.seeds)})}
+        write_atomically(self.data / "ghns.safetensors", lambda temporary: save_file(stacked, temporary, note))
+        self._record(ghns={**record, "commit": _commit()})
+
+    def scores(self) -> None:
+        """Score every candidate, on exactly its stored float16 weights; a file per architecture."""
+        listed = (architectures(split, self.task.inputs, self.task.outputs) for split in SPLITS)
+        missing = [architecture for each in listed for architecture in each if not self._is_scored(architecture)]
+        episodes = len(self.seeds) * len(self.task.scoring_seeds)
+        with Display(quiet=False).stage("scores: episodes", len(missing) * episodes) as advance:
+            for architecture in missing:
+                self._score(architecture, advance)
+        shutil.rmtree(self._units, ignore_errors=True)
+
+    def _is_scored(self, architecture: Architecture) -> bool:
+        path = self._scores(architecture)
+        return path.exists() and {*pq.read_table(path)["ghn_seed"].to_pylist()} == {*self.seeds}
+
+    def _score(self, architecture: Architecture, advance: Callable[[int], None]) -> None:
+        ghns = [GHN.from_state(self.task.inputs, self.task.outputs, load_file(self._ghn(seed))) for seed in self.seeds]
+        policies = concatenate(stored(ghn, architecture) for ghn in ghns)
+        table = self.task.evaluate(
+            [policies],
+            self.task.scoring_seeds,
+            workers=self.workers,
+            parallel=self.parallel,
+            store=self._units,
+            progress=advance,
+        )
+        seeds = pa.array([self.seeds[index] for index in table["policy"].to_pylist()], pa.int32())
+        table = table.set_column(0, "ghn_seed", seeds).drop_columns(["reason"])
+        write_atomically(self._scores(architecture), lambda temporary: pq.write_table(table, temporary))
+        means = ", ".join(f"{metric.label} {pc.mean(table[metric.column]).as_py():.3f}" for metric in self.task.metrics)
+        log(f"scores: {architecture} {means}")
+
+    def pack(self) -> None:
+        """Select per architecture by the thresholds and write the scores, the selection, the index and the manifest."""
+        rows: list[dict[str, Any]] = []
+        tables: list[pa.Table] = []
+        for split in SPLITS:
+            for architecture in architectures(split, self.task.inputs, self.task.outputs):
+                if not self._is_scored(architecture):
+                    raise UserError(f"{architecture} is not scored yet; run the stage 'scores' first")
+                table = pq.read_table(self._scores(architecture))
+                tables.append(table)
+                rows += select(self.task, split, str(architecture), table)
+        write_atomically(
+            self.data / "scores.parquet",
+            lambda temporary: pq.write_table(pa.concat_tables(tables), temporary, compression="zstd"),
+        )
+        write_atomically(
+            self.data / "selection.parquet",
+            lambda temporary: pq.write_table(
+                pa.Table.from_pylist(rows, SELECTION_SCHEMA), temporary, compression="zstd"
+            ),
+        )
+        write_manifest(self.data)
+        seen = [row for row in rows if row["split"] == "seen" and row["ghn_seed"] < HELDOUT_SEEDS_FROM]
+        passed = sum(row["kept"] for row in seen)
+        episodes = self.task.scoring_seeds
+        self._record(scores={"episodes": len(episodes), "seeds_from": episodes.start, "commit": _commit()})
+        log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass")
+
+    def _ghn(self, seed: int) -> Path:
+        return self.work / "ghns" / f"{seed:03d}.safetensors"
+
+    @property
+    def _units(self) -> Path:
+        return self.work / "scores" / "units"
+
+    def _scores(self, architecture: Architecture) -> Path:
+        return self.work / "scores" / f"{architecture}.parquet"
+
+    def _record(self, **entries: dict[str, Any]) -> None:
+        content = json.loads((self.data / "task.json").read_text())
+        content["build"] |= entries
+        write_json(self.data / "task.json", content)
+
+
+class RobotBuilder(Builder):
+    """Trains an expert, gathers the states that its students meet, and distils it into GHNs."""
+
+    stages = ("expert", "states", "ghns", "scores", "pack")
+
+    def __init__(
+        self, task: RobotPolicyTask, work: Path, seeds: int, workers: int, parallel: Backend = "processes"
+    ) -> None:
+        super().__init__(task, work, seeds, workers, parallel)
+        self.task: RobotPolicyTask = task
         self.expert_config, self.distill_config = ExpertConfig(), DistillConfig()
 
     def expert(self) -> None:
@@ -111,80 +249,14 @@ class Builder:
             return
         distill.gather_states(self.task, self.distill_config, self._expert(), self.work / "states", self.workers, log)
 
-    def ghns(self) -> None:
-        """Train one GHN per seed on the buffer, then stack them all into the data folder."""
-        from joblib import Parallel, delayed, parallel_config  # noqa: PLC0415  part of the simulator's extra
-
-        network = self._expert()
-        missing = [seed for seed in self.seeds if not self._ghn(seed).exists()]
-        jobs = (
-            delayed(distill.train_ghn)(self.task, self.distill_config, network, self._states, self._ghn(seed), seed)
-            for seed in missing
-        )
-        with parallel_config("loky", n_jobs=self.workers, inner_max_num_threads=1):
-            for line in Parallel(return_as="generator_unordered")(jobs):
-                log(f"ghns: {line}")
-        states = [load_file(self._ghn(seed)) for seed in self.seeds]
-        stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
-        sizes = {"inputs": self.task.inputs, "outputs": self.task.outputs}
-        # One entry, because safetensors writes several in an order that changes from run to run.
-        note = {"nnit": json.dumps({"task": self.task.name, **sizes, "ghn_seeds": list(self.seeds)})}
-        write_atomically(self.data / "ghns.safetensors", lambda temporary: save_file(stacked, temporary, note))
-        self._record(distill={**self.distill_config.model_dump(), "states": self._count_states(), "commit": _commit()})
-
-    def scores(self) -> None:
-        """Score every candidate, on exactly its stored float16 weights, for 64 episodes; a file per architecture."""
-        for split in SPLITS:
-            for architecture in architectures(split, self.task.inputs, self.task.outputs):
-                self._score(architecture)
-
-    def _score(self, architecture: Architecture) -> None:
-        path = self._scores(architecture)
-        if path.exists():
-            return
-        ghns = [GHN.from_state(self.task.inputs, self.task.outputs, load_file(self._ghn(seed))) for seed in self.seeds]
-        policies = concatenate(stored(ghn, architecture) for ghn in ghns)
-        table = self.task.evaluate([policies], SCORING_SEEDS, workers=self.workers)
-        seeds = pa.array([self.seeds[index] for index in table["policy"].to_pylist()], pa.int32())
-        table = table.set_column(0, "ghn_seed", seeds).drop_columns(["reason"])
-        write_atomically(path, lambda temporary: pq.write_table(table, temporary))
-        success = pc.mean(table["success_at_end"]).as_py()
-        log(f"scores: {architecture} success at end {success:.3f}, return {pc.mean(table['return']).as_py():.2f}")
-
-    def pack(self) -> None:
-        """Select per architecture by the thresholds and write the scores, the selection, the index and the manifest."""
-        rows: list[dict[str, Any]] = []
-        tables: list[pa.Table] = []
-        for split in SPLITS:
-            for architecture in architectures(split, self.task.inputs, self.task.outputs):
-                if not self._scores(architecture).exists():
-                    raise UserError(f"{architecture} is not scored yet; run the stage 'scores' first")
-                table = pq.read_table(self._scores(architecture))
-                tables.append(table)
-                rows += select(self.task, split, str(architecture), table)
-        write_atomically(
-            self.data / "scores.parquet",
-            lambda temporary: pq.write_table(pa.concat_tables(tables), temporary, compression="zstd"),
-        )
-        write_atomically(
-            self.data / "selection.parquet",
-            lambda temporary: pq.write_table(pa.Table.from_pylist(rows), temporary, compression="zstd"),
-        )
-        write_manifest(self.data)
-        seen = [row for row in rows if row["split"] == "seen" and row["ghn_seed"] < HELDOUT_SEEDS_FROM]
-        passed = sum(row["kept"] for row in seen)
-        self._record(scores={"episodes": len(SCORING_SEEDS), "seeds_from": SCORING_SEEDS.start, "commit": _commit()})
-        log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass")
+    def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
+        """Regression onto the expert, on the buffer and on states of the GHN's own."""
+        train = partial(distill.train_ghn, self.task, self.distill_config, self._expert(), self._states)
+        return train, {**self.distill_config.model_dump(), "states": self._count_states()}
 
     @property
     def _states(self) -> Path:
         return self.work / "states" / "states.safetensors"
-
-    def _ghn(self, seed: int) -> Path:
-        return self.work / "ghns" / f"{seed:03d}.safetensors"
-
-    def _scores(self, architecture: Architecture) -> Path:
-        return self.work / "scores" / f"{architecture}.parquet"
 
     def _expert(self) -> experts.Network:
         path = self.data / "expert.safetensors"
@@ -195,30 +267,53 @@ class Builder:
     def _count_states(self) -> int:
         return len(load_file(self._states)["states"])
 
-    def _record(self, **entries: dict[str, Any]) -> None:
-        content = json.loads((self.data / "task.json").read_text())
-        content["build"] |= entries
-        write_json(self.data / "task.json", content)
+
+class MNISTBuilder(Builder):
+    """Fits the features to the training digits, and GHNs to the features."""
+
+    stages = ("features", "ghns", "scores", "pack")
+
+    def __init__(self, task: MNISTPCA32, work: Path, seeds: int, workers: int, source: str | None = None) -> None:
+        super().__init__(task, work, seeds, workers)
+        self.source = source
+        self.config = mnist.MNISTConfig()
+
+    def features(self) -> None:
+        """Make the features from the digits of `source`; without it, those that are there must do."""
+        target = self.data / "task.json"
+        if self.source is None:
+            if not target.exists():
+                raise UserError(f"{self.task.name} has no features yet: name with --source {mnist.SOURCES}")
+            log("features: done")
+            return
+        earlier = json.loads(target.read_text())["build"] if target.exists() else {}
+        constants, facts = mnist.build_features(self.source, self.data / FEATURES)
+        content = {"name": self.task.name, "version": self.task.version, **constants}
+        write_json(target, {**content, "build": {**earlier, "features": {**facts, "commit": _commit()}}})
+        log(f"features: {json.dumps(facts)}")
+
+    def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
+        """Cross entropy on the training digits; there is no expert."""
+        return partial(mnist.train_ghn, self.config), {**self.config.model_dump(), "digits": 60_000}
 
 
-def select(task: RobotPolicyTask, split: str, architecture: str, scores: pa.Table) -> Iterator[dict[str, Any]]:
+def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Iterator[dict[str, Any]]:
     """The selection rows of one architecture's candidates, by GHN seed.
 
-    Of a seen architecture, the best 100 that reach both thresholds are kept, by success at the end, then return (NNiT
-    appendix C). Of a reference architecture, and of held-out seeds, all are kept: they are a yardstick, which a filter
-    would bend.
+    Of a seen architecture, the best 100 that reach all thresholds are kept; the best by the first threshold's metric,
+    then the next (NNiT appendix C). Of a reference architecture, and of held-out seeds, all are kept: they are a
+    yardstick, which a filter would bend.
     """
-    means = scores.group_by("ghn_seed").aggregate(
-        [("success_once", "mean"), ("success_at_end", "mean"), ("return", "mean"), ("seed", "count")]
-    )
+    columns = ("success_once", "success_at_end", "return")
+    means = scores.group_by("ghn_seed").aggregate([*((column, "mean") for column in columns), ("seed", "count")])
     candidates = sorted(
-        means.to_pylist(), key=lambda row: (-row["success_at_end_mean"], -row["return_mean"], row["ghn_seed"])
+        means.to_pylist(), key=lambda row: (*(-row[f"{column}_mean"] for column in task.thresholds), row["ghn_seed"])
     )
     reference = [row["ghn_seed"] for row in candidates if split != "seen" or row["ghn_seed"] >= HELDOUT_SEEDS_FROM]
     passing = [
         row["ghn_seed"]
         for row in candidates
-        if row["success_at_end_mean"] >= task.success_threshold and row["return_mean"] >= task.return_threshold
+        if all(row[f"{column}_mean"] >= least for column, least in task.thresholds.items())
     ]
     corpus = [seed for seed in passing if seed not in reference][:POLICIES_PER_ARCHITECTURE]
     kept = {*reference, *corpus}
@@ -227,9 +322,7 @@ def select(task: RobotPolicyTask, split: str, architecture: str, scores: pa.Tabl
             "architecture": architecture,
             "ghn_seed": row["ghn_seed"],
             "split": split,
-            "success_once": row["success_once_mean"],
-            "success_at_end": row["success_at_end_mean"],
-            "return": row["return_mean"],
+            **{column: row[f"{column}_mean"] for column in columns},
             "episodes": row["seed_count"],
             "kept": row["ghn_seed"] in kept,
         }

@@ -37,6 +37,7 @@ class Controller:
         self._outputs = networks[0][-1].shape[0]
         self._mean, self._std = mean, std
 
+    @np.errstate(over="ignore", invalid="ignore")  # huge weights overflow, which is no news
     def __call__(self, observations: Array) -> Array:
         """Outputs [n, outputs] on raw observations [n, inputs]; an output that is not a number becomes 0."""
         hidden = np.zeros(self._biases.shape[1:], np.float32)

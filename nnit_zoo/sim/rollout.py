@@ -6,14 +6,14 @@ of fixed length, so that an episode's bits do not change with the company it is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from nnit_zoo.sim.tabletop import JOINTS, Array, Cube, Tabletop
+from nnit_zoo.sim.tabletop import GRASP_REACH, GRASP_WIDTH, JOINTS, Array, Cube, Tabletop
 
 ACTIONS = 8  # seven joint displacements and the gripper, each in [-1, 1]
 _ARM_REACH = np.float32(0.1)  # radians that an action of 1 adds to a joint's current angle
@@ -33,23 +33,38 @@ class Start:
 
 @dataclass
 class State:
-    """What is known of n scenes, in metres and radians, poses as xyz and wxyz.
+    """What is known of n scenes, under ManiSkill's names, in metres, radians and seconds, poses as xyz and wxyz.
 
-    Joints `qpos` and `qvel` [n, 9], the tool's pose `tcp` [n, 7], the `cubes`' poses [n, k, 7], whether
-    the fingers hold the first cube as `grasped` [n], and the `goal` [n, 3].
+    Joints `qpos` and `qvel` [n, 9], the tool's `tcp_pose` [n, 7], of the cube to move `obj_pose` [n, 7] and
+    `obj_velocity`, linear and angular, [n, 6], and `goal_pos` [n, 3]. Whether the fingers hold that cube, `is_grasped`
+    [n], costs time and is known only if the task's layout has it.
     """
 
     qpos: Array
     qvel: Array
-    tcp: Array
-    cubes: Array
-    grasped: npt.NDArray[np.bool_]
-    goal: Array
+    tcp_pose: Array
+    obj_pose: Array
+    obj_velocity: Array
+    is_grasped: npt.NDArray[np.bool_]
+    goal_pos: Array
+
+    @property
+    def tcp_to_obj_pos(self) -> Array:
+        """Vector [n, 3] from the tool to the cube to move."""
+        vector: Array = self.obj_pose[:, :3] - self.tcp_pose[:, :3]
+        return vector
+
+    @property
+    def obj_to_goal_pos(self) -> Array:
+        """Vector [n, 3] from the cube to move to the goal."""
+        vector: Array = self.goal_pos - self.obj_pose[:, :3]
+        return vector
 
 
 class RobotTask(Protocol):
     """What the runner needs of a task: its start, what a policy sees, and how a state is scored."""
 
+    layout: ClassVar[Mapping[str, int]]
     episode_steps: int
 
     def start(self, seed: int) -> Start:
@@ -78,15 +93,17 @@ class Scenes:
     def __init__(self, task: RobotTask, seeds: Sequence[int]) -> None:
         starts = [task.start(seed) for seed in seeds]
         self._scenes = [Tabletop(start.qpos, start.cubes) for start in starts]
-        n, cubes = len(starts), len(starts[0].cubes)
+        n = len(starts)
         self.state = State(
             qpos=np.zeros((n, JOINTS), np.float32),
             qvel=np.zeros((n, JOINTS), np.float32),
-            tcp=np.zeros((n, 7), np.float32),
-            cubes=np.zeros((n, cubes, 7), np.float32),
-            grasped=np.zeros(n, bool),
-            goal=np.stack([start.goal for start in starts]),
+            tcp_pose=np.zeros((n, 7), np.float32),
+            obj_pose=np.zeros((n, 7), np.float32),
+            obj_velocity=np.zeros((n, 6), np.float32),
+            is_grasped=np.zeros(n, bool),
+            goal_pos=np.stack([start.goal for start in starts]),
         )
+        self._feels_grasp = "is_grasped" in task.layout
         self._read()
 
     def step(self, actions: Array) -> None:
@@ -102,11 +119,13 @@ class Scenes:
 
     def _read(self) -> None:
         state = self.state
-        for index, scene in enumerate(self._scenes):
-            scene.read(state.qpos[index], state.qvel[index], state.tcp[index], state.cubes[index])
-        distances = length(state.tcp[:, :3] - state.cubes[:, 0, :3])
-        for index, scene in enumerate(self._scenes):
-            state.grasped[index] = scene.grasps(scene.cubes[0], float(distances[index]))
+        rows = zip(state.qpos, state.qvel, state.tcp_pose, state.obj_pose, state.obj_velocity, strict=True)
+        for scene, row in zip(self._scenes, rows, strict=True):
+            scene.read(*row)
+        if self._feels_grasp:
+            near = length(state.tcp_to_obj_pos) <= GRASP_REACH
+            near &= np.sum(state.qpos[:, 7:], axis=1) <= GRASP_WIDTH
+            state.is_grasped[:] = [may and scene.grasps() for may, scene in zip(near, self._scenes, strict=True)]
 
 
 def length(vectors: Array) -> Array:

@@ -30,8 +30,10 @@ _ROBOT_BASE = (-0.615, 0.0, 0.0)
 _TABLE_HEIGHT = 0.9196429
 _TABLE_POSE = ((-0.12, 0.0, -_TABLE_HEIGHT), (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)))  # a quarter turn about z
 _GROUND_ALTITUDE = -(3.5762787e-07 + 0.91964257)  # ManiSkill's measured bounding box of the table's mesh
-# No point of a finger is farther than 0.09 m from the tool centre, none of a 4 cm cube 0.035 m from its own.
-_GRASP_REACH = 0.15
+# Where a grasp of a 4 cm cube is possible at all, in metres: no point of a finger is farther than 0.09 m from the tool
+# centre, none of the cube 0.035 m from its own, and fingers farther apart than its diagonal cannot both touch it.
+GRASP_REACH = 0.15
+GRASP_WIDTH = 0.075
 _MIN_GRASP_FORCE = 0.5
 _MAX_GRASP_ANGLE = math.radians(85)
 
@@ -119,9 +121,9 @@ class Tabletop:
             joint.set_drive_properties(1e3, 1e2, 100, "force")
             joint.set_friction(0.0)
         self._build_table(sapien)
-        self.cubes = [self._build_cube(sapien, cube) for cube in cubes]
+        self._cube, *_ = [self._build_cube(sapien, cube) for cube in cubes]
         by_name = {link.name: link for link in self._robot.links}
-        self.tcp = by_name["panda_hand_tcp"]
+        self._tcp = by_name["panda_hand_tcp"]
         self._fingers = (by_name["panda_leftfinger"], by_name["panda_rightfinger"])
         self._robot.qpos = qpos
         self._robot.qvel = np.zeros(JOINTS)
@@ -150,49 +152,48 @@ class Tabletop:
         """Drive the joints to `targets` [9] (radians, metres) for one control step of 50 ms."""
         for joint, target in zip(self._joints, targets, strict=True):
             joint.set_drive_target(target)
+        self.advance()
+
+    def advance(self) -> None:
+        """Let the physics go on for one control step of 50 ms."""
         step = self._physics.step
         for _ in range(SUBSTEPS):
             step()
 
-    def read(self, qpos: Array, qvel: Array, tcp: Array, cubes: Array) -> None:
-        """Write the joints' angles and velocities [9], the tool's pose [7] and the cubes' poses [k, 7] into arrays."""
+    def read(self, qpos: Array, qvel: Array, tcp_pose: Array, obj_pose: Array, obj_velocity: Array) -> None:
+        """Write joint angles and velocities [9], the tool's pose [7], the first cube's pose [7] and velocity [6]."""
         qpos[:] = self._robot.qpos
         qvel[:] = self._robot.qvel
-        pose = self.tcp.entity_pose
-        tcp[:3], tcp[3:] = pose.p, pose.q
-        for row, cube in zip(cubes, self.cubes, strict=True):
-            pose = cube.entity_pose
-            row[:3], row[3:] = pose.p, pose.q
+        pose = self._tcp.entity_pose
+        tcp_pose[:3], tcp_pose[3:] = pose.p, pose.q
+        pose = self._cube.entity_pose
+        obj_pose[:3], obj_pose[3:] = pose.p, pose.q
+        obj_velocity[:3], obj_velocity[3:] = self._cube.linear_velocity, self._cube.angular_velocity
 
-    def grasps(self, cube: Any, distance: float) -> bool:
-        """Whether both fingers press on the cube, `distance` metres from the tool (ManiSkill's Panda.is_grasping)."""
-        if distance > _GRASP_REACH:
-            return False
-        impulses: dict[Any, Array] = {}
+    def grasps(self) -> bool:
+        """Whether both fingers press on the first cube (ManiSkill's Panda.is_grasping)."""
+        cube = self._cube
+        left, right = self._fingers
+        touching: dict[Any, list[tuple[Any, int]]] = {left: [], right: []}
         for contact in self._physics.get_contacts():
             first, second = contact.bodies
-            if second is cube and first in self._fingers:
-                finger, sign = first, 1
-            elif first is cube and second in self._fingers:
-                finger, sign = second, -1
-            else:
-                continue
-            impulse = impulses.setdefault(finger, np.zeros(3, np.float32))
-            for point in contact.points:
-                impulse += sign * point.impulse
-        return len(impulses) == 2 and all(
-            _presses(impulses[finger], finger.entity_pose.q, side)
-            for finger, side in zip(self._fingers, (1, -1), strict=True)
-        )
+            if second is cube and (first is left or first is right):
+                touching[first].append((contact, 1))
+            elif first is cube and (second is left or second is right):
+                touching[second].append((contact, -1))
+        return all(touching.values()) and _presses(touching[left], left, 1) and _presses(touching[right], right, -1)
 
 
-def _presses(impulse: Array, quaternion: Array, side: int) -> bool:
-    """Whether a finger's contact impulse [3] (N s) is firm and along its opening direction, `side` times its y axis."""
-    force = [float(component) / TIMESTEP for component in impulse]
-    magnitude = math.hypot(*force)
-    if magnitude < _MIN_GRASP_FORCE:
+def _presses(contacts: Sequence[tuple[Any, int]], finger: Any, side: int) -> bool:
+    """Whether contacts, signed, push a finger firmly along its opening direction, `side` times its y axis."""
+    fx = fy = fz = 0.0
+    for contact, sign in contacts:
+        for point in contact.points:
+            x, y, z = point.impulse.tolist()
+            fx, fy, fz = fx + sign * x, fy + sign * y, fz + sign * z
+    magnitude = math.hypot(fx, fy, fz)
+    if magnitude < _MIN_GRASP_FORCE * TIMESTEP:
         return False
-    w, x, y, z = map(float, quaternion)
-    opening = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
-    cosine = side * sum(a * b for a, b in zip(opening, force, strict=True)) / magnitude
-    return math.acos(min(1.0, max(-1.0, cosine))) <= _MAX_GRASP_ANGLE
+    w, x, y, z = finger.entity_pose.q.tolist()
+    along = 2 * (x * y - w * z) * fx + (1 - 2 * (x * x + z * z)) * fy + 2 * (y * z + w * x) * fz
+    return math.acos(min(1.0, max(-1.0, side * along / magnitude))) <= _MAX_GRASP_ANGLE

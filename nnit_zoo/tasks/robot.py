@@ -2,45 +2,83 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
+from functools import partial
 from itertools import groupby, islice
+from pathlib import Path
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+from torch import Tensor
 
+from nnit_zoo.atomic import write_atomically
+from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.sim import stock
 from nnit_zoo.sim.control import Controller, padded_shape
 from nnit_zoo.sim.rollout import ACTIONS, Start, State, rollout
 from nnit_zoo.sim.tabletop import Array, require_simulator
-from nnit_zoo.tasks.task import EPISODE_SCHEMA, Task
+from nnit_zoo.tasks.task import EPISODE_SCHEMA, Metric, Simulator, Task
 
-SCENES = 50  # in lockstep; more gain nothing and leave the cache
-_Job = tuple[int, Sequence[Array], int]  # row of the result, network, seed
+# Episodes in lockstep, which are a unit of work. More of `fast` gain nothing and leave the cache; stock ManiSkill plays
+# one at a time on a CPU.
+SCENES: dict[Simulator, int] = {"fast": 50, "stock": 1, "stock-gpu": 1024}
+_SCORES = ("return", "success_once", "success_at_end")
 
 
 class RobotPolicyTask(Task):
-    """A tabletop task for ManiSkill's Panda under pd_joint_delta_pos, on physx_cpu, 50 steps of 50 ms an episode."""
+    """A tabletop task for ManiSkill's Panda under pd_joint_delta_pos, on physx_cpu, 50 steps of 50 ms an episode.
 
+    `layout` names the parts of the observation in order, each a part of `State`, with how many entries it has.
+    """
+
+    layout: ClassVar[Mapping[str, int]]
     outputs = ACTIONS
     episode_steps = 50
+    simulator: Simulator = "fast"
+    metrics = (
+        Metric("success_at_end", "success at end", "%"),
+        Metric("success_once", "success once", "%"),
+        Metric("return", "return", ""),
+    )
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.inputs = sum(cls.layout.values())
 
     @abstractmethod
     def start(self, seed: int) -> Start:
         """The start of the episode with this seed."""
 
-    @abstractmethod
     def observe(self, state: State) -> Array:
-        """Raw observations [n, inputs]."""
+        """Raw observations [n, inputs]: the parts that `layout` names."""
+        parts = [getattr(state, name).reshape(-1, size) for name, size in self.layout.items()]
+        return np.concatenate(parts, axis=1, dtype=np.float32)
 
     @abstractmethod
     def score(self, state: State) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Reward [n] in [0, 1] and success [n] of each state."""
 
+    def simulated_by(self, simulator: Simulator) -> Self:
+        """This task on another simulator: `fast` is ours, `stock` plain ManiSkill, `stock-gpu` the same on a GPU."""
+        task = copy(self)
+        task.simulator = simulator
+        return task
+
+    def behaviour(self, outputs: Tensor) -> Tensor:
+        """The actions: the controller clips them to [-1, 1]."""
+        return outputs.clamp(-1, 1)
+
     def check_installed(self) -> None:
-        """Raise UserError if the simulator is not installed."""
+        """Raise UserError if the simulator, or the GPU that it needs, is missing."""
         require_simulator()
+        if self.simulator == "stock-gpu":
+            stock.require_gpu()
 
     def evaluate(
         self,
@@ -48,9 +86,11 @@ class RobotPolicyTask(Task):
         seeds: Sequence[int],
         *,
         workers: int = 2,
+        parallel: Backend = "processes",
+        store: Path | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> pa.Table:
-        """One row of EPISODE_SCHEMA per policy and seed: a function of task, weights and seed alone."""
+        """One row of EPISODE_SCHEMA per policy and seed: a function of task, simulator, weights and seed alone."""
         self.check(policies, seeds)
         self.check_installed()
         names = [str(batch.architecture) for batch in policies for _ in range(len(batch))]
@@ -67,33 +107,39 @@ class RobotPolicyTask(Task):
         }
         if progress:
             progress(int((~finite).sum()) * count)
-        for rows, returns, once, at_end in run_units(self, _units(policies, finite, seeds), workers):
-            table["return"][rows], table["success_once"][rows], table["success_at_end"][rows] = returns, once, at_end
+        units = _units(policies, finite, seeds, SCENES[self.simulator])
+        for unit, scores in _scored(self, units, workers, parallel, store):
+            rows = [job.row for job in unit]
+            for name, values in zip(_SCORES, scores, strict=True):
+                table[name][rows] = values
             if progress:
-                progress(len(rows))
+                progress(len(unit))
         return pa.table(
             {name: pa.array(table[name], field.type) for name, field in zip(table, EPISODE_SCHEMA, strict=True)}
         )
 
 
-_Scores = tuple[list[int], Array, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]
+class _Job(NamedTuple):
+    """One episode to play: its row in the result, the policy's number and network, and the seed."""
+
+    row: int
+    policy: int
+    network: Sequence[Array]
+    seed: int
 
 
-def run_units(task: RobotPolicyTask, units: Iterator[list[_Job]], workers: int) -> Iterator[_Scores]:
-    """Score units of work in this process (`workers` 1) or in several, in the order they finish."""
-    if workers == 1:
-        yield from (_score(task, unit) for unit in units)
-        return
-    from joblib import Parallel, delayed, parallel_config  # noqa: PLC0415  only scoring needs it
+class _Unit(tuple[_Job, ...]):
+    """Jobs that run in lockstep, with networks of one padded shape."""
 
-    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
-        yield from Parallel(return_as="generator_unordered")(delayed(_score)(task, unit) for unit in units)
+    def __str__(self) -> str:
+        first, last = self[0], self[-1]
+        return f"episodes from seed {first.seed} of policy {first.policy} to seed {last.seed} of policy {last.policy}"
 
 
 def _units(
-    policies: Sequence[PolicyBatch], finite: npt.NDArray[np.bool_], seeds: Sequence[int]
-) -> Iterator[list[_Job]]:
-    """Jobs of finite policies in runs of at most SCENES with networks of one padded shape."""
+    policies: Sequence[PolicyBatch], finite: npt.NDArray[np.bool_], seeds: Sequence[int], scenes: int
+) -> Iterator[_Unit]:
+    """The jobs of finite policies, in units of at most `scenes`."""
 
     def jobs() -> Iterator[_Job]:
         policy = 0
@@ -103,17 +149,54 @@ def _units(
                 if finite[policy]:
                     network = [layer[index] for layer in layers]
                     for offset, seed in enumerate(seeds):
-                        yield policy * len(seeds) + offset, network, seed
+                        yield _Job(policy * len(seeds) + offset, policy, network, seed)
                 policy += 1
 
-    for _, group in groupby(jobs(), key=lambda job: padded_shape(job[1])):
-        while unit := list(islice(group, SCENES)):
+    for _, group in groupby(jobs(), key=lambda job: padded_shape(job.network)):
+        while unit := _Unit(islice(group, scenes)):
             yield unit
 
 
-def _score(task: RobotPolicyTask, unit: list[_Job]) -> _Scores:
-    rows, networks, seeds = zip(*unit, strict=True)
-    controller = Controller(networks, task.observation_mean, task.observation_std)
-    episodes = rollout(task, seeds, controller)
-    returns = np.array([reward.sum(dtype=np.float64) for reward in episodes.rewards.T], np.float32)
-    return list(rows), returns, np.any(episodes.success, axis=0, keepdims=True)[0], episodes.success[-1]
+def _scored(
+    task: RobotPolicyTask, units: Iterator[_Unit], workers: int, parallel: Backend, store: Path | None
+) -> Iterator[tuple[_Unit, Array]]:
+    """Each unit with its scores [3, n]; a unit that `store` has a file of is not played again."""
+    play = partial(_score, task)
+    if store is None:
+        yield from unordered(play, units, workers, parallel)
+        return
+    missing = []
+    for unit in units:
+        path = store / _key(task, unit)
+        scores = np.fromfile(path, np.float32) if path.exists() else np.empty(0, np.float32)
+        if scores.size == len(_SCORES) * len(unit):  # a power cut can leave less
+            yield unit, scores.reshape(len(_SCORES), -1)
+        else:
+            missing.append(unit)
+    for unit, scores in unordered(play, missing, workers, parallel):
+        write_atomically(store / _key(task, unit), scores.tofile)
+        yield unit, scores
+
+
+def _key(task: RobotPolicyTask, unit: _Unit) -> str:
+    """A hash of all that a unit's scores depend on, but for the code."""
+    digest = hashlib.sha256(f"{task.name} {task.version} {task.simulator}".encode())
+    digest.update(task.observation_mean.tobytes() + task.observation_std.tobytes())
+    for job in unit:
+        digest.update(f" {job.seed} {[layer.shape for layer in job.network]}".encode())
+        for layer in job.network:
+            digest.update(layer.tobytes())
+    return digest.hexdigest()
+
+
+def _score(task: RobotPolicyTask, unit: _Unit) -> Array:
+    """Return, success once and success at the end [3, n] of a unit's episodes."""
+    seeds = [job.seed for job in unit]
+    controller = Controller([job.network for job in unit], task.observation_mean, task.observation_std)
+    if task.simulator == "fast":
+        episodes = rollout(task, seeds, controller)
+    else:
+        device: stock.Device = "physx_cpu" if task.simulator == "stock" else "physx_cuda"
+        episodes = stock.rollout(task, task.name, seeds, controller, device)
+    returns = [reward.sum(dtype=np.float64) for reward in episodes.rewards.T]
+    return np.array([returns, episodes.success.any(axis=0), episodes.success[-1]], np.float32)

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
+from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -11,32 +15,48 @@ import torch
 
 from nnit_zoo import tasks
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.build import distill, expert, stages
+from nnit_zoo.build import distill, expert, mnist, stages
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
+from nnit_zoo.build.fit import Fit
+from nnit_zoo.build.ghn import GHN
+from nnit_zoo.cli import main
 from nnit_zoo.errors import UserError
 from nnit_zoo.materialise import materialise
 from nnit_zoo.tasks import task as task_module
+from nnit_zoo.tasks.mnist import MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
+from nnit_zoo.tasks.task import data_folder
 from nnit_zoo.zoo import Zoo
 
 TINY_EXPERT = ExpertConfig(total_steps=200, environments=2, hidden=16, epochs=1, minibatch=50, evaluate_every=1)
-TINY_DISTILL = DistillConfig(rounds=2, episodes_per_round=2, round_steps=2, steps=3, architectures_per_step=2)
+TINY_DISTILL = DistillConfig(
+    rounds=2, episodes_per_round=2, round_steps=2, own_episodes=2, steps=3, architectures_per_step=2
+)
+TINY_FIT = mnist.MNISTConfig(steps=3, states_per_architecture=8)
 FEW = {"seen": ("16-32-64-16", "64-64-64-64"), "unseen": ("16-16-16-32",), "excluded": ("32-16-16-16",)}
 
 
 @pytest.fixture
 def builder(monkeypatch):
     """A function that makes a toy builder whose package data go to a folder of the test's."""
+    torch.set_num_threads(1)  # as `build` does; bits depend on it
     monkeypatch.setattr(expert, "EVALUATION_SEEDS", range(2))
-    monkeypatch.setattr(stages, "SCORING_SEEDS", range(2))
+    monkeypatch.setattr(PickCube, "scoring_seeds", range(2))
     monkeypatch.setattr(stages, "architectures", few_architectures)
 
-    def make(folder):
+    def make(folder, task="PickCube-v1"):
         monkeypatch.setattr(stages, "data_folder", lambda name: folder / "data")
         monkeypatch.setattr(task_module, "data_folder", lambda name: folder / "data")
-        built = stages.Builder(PickCube(), folder / "work", seeds=2, workers=1)
-        built.expert_config, built.distill_config = TINY_EXPERT, TINY_DISTILL
+        if task == "MNIST-PCA32":
+            (folder / "data").mkdir(parents=True, exist_ok=True)
+            if not (folder / "data" / "task.json").exists():
+                shutil.copy(data_folder(task) / "task.json", folder / "data")
+            built = stages.MNISTBuilder(MNISTPCA32(), folder / "work", seeds=2, workers=1)
+            built.config = TINY_FIT
+        else:
+            built = stages.RobotBuilder(PickCube(), folder / "work", seeds=2, workers=1)
+            built.expert_config, built.distill_config = TINY_EXPERT, TINY_DISTILL
         return built
 
     return make
@@ -47,7 +67,7 @@ def few_architectures(split, inputs, outputs):
 
 
 def run_all(builder):
-    for stage in stages.STAGES:
+    for stage in builder.stages:
         getattr(builder, stage)()
 
 
@@ -68,7 +88,7 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
     }
     for module, name in (
         (expert.Training, "iterate"),
-        (distill.Regression, "run"),
+        (Fit, "run"),
         (distill, "train_ghn"),
         (PickCube, "evaluate"),
         (stages, "write_manifest"),
@@ -90,7 +110,69 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
     }
     record = json.loads((tmp_path / "killed" / "data" / "task.json").read_text())
     assert record["build"]["expert"]["config"]["hidden"] == 16
-    assert record["build"]["distill"]["states"] == 2 * 2 * 50
+    assert record["build"]["ghns"]["states"] == 2 * 2 * 50
+
+
+def test_a_killed_build_of_mnist_ends_with_the_same_bytes_and_a_zoo_with_accuracies(builder, tmp_path, monkeypatch):
+    run_all(builder(tmp_path / "whole", "MNIST-PCA32"))
+    whole = artifacts(tmp_path / "whole")
+    assert set(whole) == {
+        "ghns.safetensors",
+        "index.parquet",
+        "manifest.json",
+        "scores.parquet",
+        "selection.parquet",
+    }
+    for module, name in ((mnist, "train_ghn"), (MNISTPCA32, "evaluate"), (stages, "write_manifest")):
+        with monkeypatch.context() as killing:
+            kill_second_call(killing, module, name)
+            with pytest.raises(KeyboardInterrupt):
+                run_all(builder(tmp_path / "killed", "MNIST-PCA32"))
+                run_all(builder(tmp_path / "killed", "MNIST-PCA32"))
+    run_all(builder(tmp_path / "killed", "MNIST-PCA32"))
+    assert artifacts(tmp_path / "killed") == whole
+
+    materialise(tmp_path / "whole" / "data", tmp_path / "zoo")
+    zoo = Zoo.open(tmp_path / "zoo")
+    assert len(zoo) == 4  # of the unseen and the excluded architecture; seen ones pass only when they are trained
+    row = zoo.index.to_pylist()[0]
+    assert row["success_at_end"] is None and row["episodes"] == 100
+    table = MNISTPCA32().evaluate([zoo.batch(row["architecture"], row["split"])[0]], range(100))
+    assert row["return"] == pytest.approx(np.mean(table["return"].to_numpy()))
+    record = json.loads((tmp_path / "whole" / "data" / "task.json").read_text())
+    assert record["build"]["ghns"]["steps"] == 3 and record["build"]["features"]["train"] == 60_000
+
+
+def test_features_are_made_from_the_named_source_and_keep_the_record_of_the_zoo(builder, tmp_path):
+    sample = Path(__file__).parents[1] / "zoo" / "mnist"
+    built = builder(tmp_path, "MNIST-PCA32")
+    built.source = str(sample)
+    task_json = tmp_path / "data" / "task.json"
+    earlier = json.loads(task_json.read_text())
+    earlier["build"]["ghns"] = {"steps": 3}
+    task_json.write_text(json.dumps(earlier))
+    built.features()
+    record = json.loads(task_json.read_text())
+    assert record["build"]["features"]["train"] == 16 and record["build"]["ghns"] == {"steps": 3}
+    assert len(set(record["observation_std"])) == 1 and record["observation_std"] != earlier["observation_std"]
+    task_json.unlink()
+    built.source = None
+    with pytest.raises(UserError, match="--source a folder with its four IDX files"):
+        built.features()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--task", "MNIST-PCA32", "--stage", "expert"], "there are features, ghns, scores, pack"),
+        (["--task", "PickCube-v1", "--source", "ylecun/mnist"], "--source is not for PickCube-v1"),
+    ],
+)
+def test_a_build_that_cannot_be_says_why(options, message, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["nnit-zoo", "build", *options])
+    with pytest.raises(SystemExit):
+        main()
+    assert message in capsys.readouterr().err
 
 
 def kill_second_call(monkeypatch, module, name):
@@ -110,6 +192,18 @@ def test_a_stage_without_the_one_before_says_which_to_run(builder, tmp_path):
         builder(tmp_path).states()
     with pytest.raises(UserError, match="stage 'scores' first"):
         builder(tmp_path).pack()
+
+
+def test_scores_of_other_seeds_are_made_again(builder, tmp_path):
+    run_all(builder(tmp_path, "MNIST-PCA32"))
+    more = builder(tmp_path, "MNIST-PCA32")
+    more.seeds = range(3)
+    with pytest.raises(UserError, match="stage 'scores' first"):
+        more.pack()
+    more.ghns()
+    more.scores()
+    more.pack()
+    assert set(pq.read_table(tmp_path / "data" / "scores.parquet")["ghn_seed"].to_pylist()) == {0, 1, 2}
 
 
 def scores_of(means):
@@ -133,6 +227,12 @@ def test_selection_keeps_the_best_that_reach_both_thresholds():
     many = scores_of([(0.9 + 0.1 * (seed % 2), 36.0) for seed in range(120)])
     kept = [row["ghn_seed"] for row in stages.select(task, "seen", "x", many) if row["kept"]]
     assert len(kept) == 100 and set(range(1, 120, 2)) <= set(kept)
+
+
+def test_weight_noise_is_relative_to_each_block():
+    fit = Fit(GHN(42, 8, 0), TINY_DISTILL, seed=0)
+    block = 3 * torch.ones(50, 100)
+    assert (fit.noisy(block) - block).std() == pytest.approx(3 * TINY_DISTILL.weight_noise, rel=0.05)
 
 
 def test_advantages_follow_their_definition():

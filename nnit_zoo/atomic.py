@@ -20,10 +20,15 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write `content` as indented JSON, atomically."""
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write `content`, atomically."""
 
     def write(temporary: Path) -> None:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")
+        temporary.write_bytes(content)
 
     write_atomically(path, write)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write `content` as indented JSON, atomically."""
+    write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())

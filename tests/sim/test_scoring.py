@@ -1,8 +1,6 @@
-"""PickCube-v1 against stock ManiSkill rebuilt for each episode, and against itself in other orders and processes."""
+"""Scoring policies on the robot tasks: the table of episodes, and that nothing but the episode decides its row."""
 
 from __future__ import annotations
-
-import warnings
 
 import numpy as np
 import pytest
@@ -13,69 +11,20 @@ from nnit_zoo.architecture import Architecture, architectures
 from nnit_zoo.build import expert
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
-from nnit_zoo.sim import headless
 from nnit_zoo.sim.control import Controller
-from nnit_zoo.sim.rollout import rollout
 from nnit_zoo.tasks.task import data_folder
 
 TASK = tasks.get("PickCube-v1")
 
 
-@pytest.fixture(scope="module")
-def stock():
-    """Stock ManiSkill, rebuilt for every episode."""
-    headless.enable()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import gymnasium
-        import mani_skill.envs  # noqa: F401
-
-        env = gymnasium.make(
-            "PickCube-v1",
-            obs_mode="state",
-            num_envs=1,
-            sim_backend="physx_cpu",
-            render_backend="none",
-            reconfiguration_freq=1,
-        )
-    yield env
-    env.close()
-
-
-def expert_actions(observations):
-    return expert.mean_action(NETWORK, observations)
-
-
 NETWORK = expert.load(data_folder("PickCube-v1") / "expert.safetensors")
 
 
-@pytest.mark.parametrize("seed", [0, 7, 12345])
-@pytest.mark.parametrize("actor", ["expert", "random"])
-def test_every_step_equals_stock_maniskill(stock, seed, actor):
-    generator = np.random.default_rng(seed)
-
-    def act(observations):
-        if actor == "expert":
-            return expert_actions(observations)
-        return generator.uniform(-1.2, 1.2, (len(observations), 8)).astype(np.float32)
-
-    ours = rollout(TASK, [seed], act)
-    observation, _ = stock.reset(seed=seed)
-    np.testing.assert_allclose(ours.observations[0, 0], observation[0], atol=1e-5)
-    for step, action in enumerate(ours.actions[:, 0]):
-        observation, reward, _, _, info = stock.step(action)
-        np.testing.assert_allclose(ours.observations[step + 1, 0], observation[0], atol=1e-5)
-        assert ours.rewards[step, 0] == pytest.approx(float(reward), abs=1e-5)
-        assert ours.success[step, 0] == bool(info["success"])
-    if actor == "expert":  # contact and success were really part of the comparison
-        assert ours.observations[:, 0, 18].any() and ours.success[-1, 0]
-
-
-def noisy_policies(count, seed=0):
+def noisy_policies(count, inputs=42):
     """Policies of three architectures, with random weights."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     batches = []
-    for architecture in architectures("seen", 42, 8)[:: 64 // 3][:3]:
+    for architecture in architectures("seen", inputs, 8)[:: 64 // 3][:3]:
         shapes = [(count, *shape) for shape in architecture.block_shapes]
         layers = tuple(torch.randn(shape, generator=generator) / shape[2] ** 0.5 for shape in shapes)
         batches.append(PolicyBatch(architecture, layers))
@@ -99,7 +48,7 @@ def expert_policy(noise, copies):
 
 def test_episodes_do_not_depend_on_order_company_or_processes():
     policies = [expert_policy(0.05, 2), *noisy_policies(1)]
-    seeds = [5, 6, 7, 8]
+    seeds = [5, 8]
     table = TASK.evaluate(policies, seeds, workers=1).to_pylist()
     backward = TASK.evaluate(policies[::-1], seeds[::-1], workers=1).to_pylist()
     parallel = TASK.evaluate(policies, seeds, workers=2).to_pylist()
@@ -112,9 +61,12 @@ def test_episodes_do_not_depend_on_order_company_or_processes():
     assert max(row["return"] for row in table) > 20  # some of these episodes grasp the cube
 
 
-def test_rows_are_complete_and_ordered_and_progress_counts_every_episode():
+@pytest.mark.parametrize("name", ["PickCube-v1", "PushCube-v1", "StackCubeEasy-v1"])
+def test_rows_are_complete_and_ordered_and_progress_counts_every_episode(name):
+    task = type(tasks.get(name))()
+    task.record = {"observation_mean": [0.0] * task.inputs, "observation_std": [1.0] * task.inputs}
     counts = []
-    table = TASK.evaluate(noisy_policies(2), [3, 1], workers=1, progress=counts.append)
+    table = task.evaluate(noisy_policies(2, task.inputs), [3, 1], workers=1, progress=counts.append)
     assert table["policy"].to_pylist() == [index for index in range(6) for _ in range(2)]
     assert table["seed"].to_pylist() == [3, 1] * 6
     assert sum(counts) == 12

@@ -1,0 +1,143 @@
+"""What building MNIST-PCA32's zoo needs besides the common stages: its features, and GHNs trained on labelled digits.
+
+The paper is silent on how its GHNs were trained here. There is no expert: cross entropy on the training digits, over
+seen architectures drawn at random.
+"""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from safetensors.numpy import save_file as save_arrays
+from torch import nn
+
+from nnit_zoo.atomic import write_atomically
+from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
+from nnit_zoo.build.ghn import GHN
+from nnit_zoo.errors import UserError
+from nnit_zoo.tasks.mnist import MNISTPCA32
+
+PARTS = {"train": "train", "test": "t10k"}  # part -> how the names of its two original files begin
+SOURCES = "a folder with its four IDX files, or ylecun/mnist (needs nnit[datasets])"
+
+Bytes = npt.NDArray[np.uint8]
+
+
+class MNISTConfig(FitConfig):
+    """Settings of each GHN's training, found by trial on one CPU core.
+
+    Many digits per architecture and a strong weight decay raise the accuracy, the decay that of the smallest
+    architecture most; the weight noise keeps it when weights are a few per cent off.
+    """
+
+    steps: int = 3000
+    learning_rate: float = 8e-3
+    weight_decay: float = 0.3
+    architectures_per_step: int = 2
+    states_per_architecture: int = 2048
+    weight_noise: float = 0.03
+    label_smoothing: float = 0.05
+
+
+def read_digits(source: str) -> dict[str, tuple[Bytes, Bytes]]:
+    """Images [n, 784] and labels [n] of the parts `train` and `test`.
+
+    `source` is a folder with the four original IDX files, gzipped or not, or else a data set that
+    `datasets.load_dataset` finds, such as `ylecun/mnist`. Raises UserError if it is neither.
+    """
+    folder = Path(source)
+    if list(folder.glob("*-ubyte*")):
+        return {
+            part: (
+                _read_idx(folder, f"{prefix}-images-idx3-ubyte").reshape(-1, 784),
+                _read_idx(folder, f"{prefix}-labels-idx1-ubyte"),
+            )
+            for part, prefix in PARTS.items()
+        }
+    try:
+        from datasets import load_dataset  # noqa: PLC0415  only this source needs it
+
+        loaded = load_dataset(source)
+        return {
+            part: (
+                np.stack([np.asarray(image, np.uint8).reshape(784) for image in loaded[part]["image"]]),
+                np.asarray(loaded[part]["label"], np.uint8),
+            )
+            for part in PARTS
+        }
+    except (ImportError, OSError, ValueError, KeyError) as error:
+        raise UserError(f"no MNIST in '{source}', but {error}; give {SOURCES}") from None
+
+
+def _read_idx(folder: Path, name: str) -> Bytes:
+    """The array in an IDX file: two zero bytes, the type, the number of axes, their big-endian sizes, the items."""
+    path = next((path for path in (folder / name, folder / f"{name}.gz") if path.is_file()), None)
+    if path is None:
+        raise UserError(f"there is no {name} or {name}.gz in {folder}")
+    content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    axes = content[3]
+    shape = np.frombuffer(content, ">u4", axes, offset=4)
+    return np.frombuffer(content, np.uint8, offset=4 + 4 * axes).reshape(shape)
+
+
+def fit_pca(images: Bytes, components: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Mean [784] and leading principal components [components, 784] of images in [0, 1], rounded to float32.
+
+    The sums are over integers, so exact; only the eigenvectors can differ between machines, in their last float64 bits.
+    A component's sign is such that its entry of largest size is positive.
+    """
+    pixels = images.astype(np.float64)
+    count, total, products = len(pixels), pixels.sum(0), pixels.T @ pixels
+    covariance = products - np.outer(total, total) / count
+    _, vectors = np.linalg.eigh(covariance)
+    leading = np.ascontiguousarray(vectors[:, : -components - 1 : -1].T)  # safetensors stores memory order
+    largest = np.take_along_axis(leading, np.abs(leading).argmax(1)[:, None], axis=1)
+    return (total / count / 255).astype(np.float32), (leading * np.sign(largest)).astype(np.float32)
+
+
+def project(
+    images: Bytes, mean: npt.NDArray[np.float32], components: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float16]:
+    """Features [n, components] of images [n, 784]: computed in float64, rounded once to float16."""
+    return ((images / 255 - mean) @ components.T.astype(np.float64)).astype(np.float16)
+
+
+def build_features(source: str, target: Path) -> tuple[dict[str, list[float]], dict[str, float]]:
+    """Write the features and labels of both parts, and the basis, to `target`; gives the task's constants, and facts.
+
+    Basis and constants are fitted on the training digits alone. All components are divided by one number, the root mean
+    square of a feature: a unit variance for each of them costs accuracy (docs/deviations.md).
+    """
+    digits = read_digits(source)
+    images = digits["train"][0]
+    mean, components = fit_pca(images, MNISTPCA32.inputs)
+    tensors: dict[str, npt.NDArray[Any]] = {"mean": mean, "components": components}
+    for part, (pictures, labels) in digits.items():
+        tensors |= {f"{part}.features": project(pictures, mean, components), f"{part}.labels": labels}
+    write_atomically(target, lambda temporary: save_arrays(tensors, temporary))
+    squares = tensors["train.features"].astype(np.float64) ** 2
+    scale = float(np.float32(np.sqrt(squares.mean())))
+    constants = {"observation_mean": [0.0] * len(components), "observation_std": [scale] * len(components)}
+    kept = squares.sum(1).mean() / (images / 255).var(0).sum()
+    return constants, {**{part: len(labels) for part, (_, labels) in digits.items()}, "variance_kept": round(kept, 6)}
+
+
+def train_ghn(config: MNISTConfig, target: Path, seed: int) -> str:
+    """Train one seed's GHN on the training digits; stores its state as float16 safetensors; a log line."""
+    torch.set_num_threads(1)
+    task = MNISTPCA32()
+    observations, labels = task.digits("train")
+    ghn = GHN(task.inputs, task.outputs, seed)
+    ghn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth faster
+    optimizer = torch.optim.AdamW(
+        ghn.parameters(), lr=config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
+    )
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=config.steps)
+    fit = Fit(ghn, config, seed, nn.CrossEntropyLoss(label_smoothing=config.label_smoothing))
+    loss = fit.run(observations, labels, config.steps, optimizer, schedule)
+    return save_ghn(ghn, target, seed=seed, loss=loss)
