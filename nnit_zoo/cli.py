@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-import json
+import errno
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
+from nnit_zoo.console import print_json, print_rows, print_table
 from nnit_zoo.errors import UserError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from nnit_zoo.files import Manifest
 
 app = App(
     name="nnit-zoo",
@@ -20,9 +25,11 @@ app = App(
     version=lambda: version("nnit"),
     default_parameter=Parameter(negative=""),
 )
+app.register_install_completion_command(help="Set up completion in your shell.")
 app.command("nnit_zoo.build.stages:build", name="build", help="Build a task's zoo: expert, GHNs, selection, manifest.")
 
 Json = Annotated[bool, Parameter(name="--json")]
+Split = Literal["seen", "unseen", "excluded", "heldout_seed"]
 
 
 @app.command(name="list")
@@ -34,26 +41,26 @@ def list_zoos(*, as_json: Json = False) -> None:
     """
     from nnit_zoo import files
 
-    zoos = [_describe(task) for task in files.tasks_with_zoo()]
+    zoos = [files.describe(task) for task in files.tasks_with_zoo()]
     if as_json:
-        _print_json(zoos)
+        print_json(zoos)
         return
     cells = [
         (
             zoo["task"],
-            f"{zoo['splits'].get('seen', {}).get('policies', 0)}",
-            f"{zoo['policies']}",
+            f"{zoo['splits'].get('seen', {}).get('policies', 0):,}",
+            f"{zoo['policies']:,}",
             files.readable(zoo["bytes"]),
-            "yes" if zoo["downloaded"] else "no",
+            _downloaded(zoo),
         )
         for zoo in zoos
     ]
-    _print_table(("task", "training policies", "all policies", "size", "downloaded"), cells)
+    print_table(("task", "training policies", "all policies", "size", "downloaded"), cells)
 
 
 @app.command
 def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json: Json = False) -> None:
-    """Show what a zoo holds: its splits with their mean scores, or the policies of one architecture.
+    """Show a zoo's splits with their mean scores and what its policies see, or the policies of one architecture.
 
     Args:
         task: Name of the task.
@@ -64,74 +71,229 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
     from nnit_zoo.architecture import check_known
 
     if architecture is None:
-        zoo = _describe(task)
+        zoo = files.describe(task) | {"layout": _layout(task)}
         if as_json:
-            _print_json(zoo)
+            print_json(zoo)
             return
-        numbers = [
-            (split, *(_text(value) for value in split_row.values())) for split, split_row in zoo["splits"].items()
-        ]
-        _print_table(("split", "architectures", "policies", "success at end", "success once", "return"), numbers)
+        rows = [{"split": split, **row} for split, row in zoo["splits"].items()]
+        print_rows(rows, ("split", "architectures", "policies", *files.SCORES))
+        if zoo["layout"]:
+            print_table(("input", "entries"), list(zoo["layout"].items()))
         return
     check_known([architecture])
     policies = files.read_index(files.embedded(task) / files.INDEX, architecture).to_pylist()
     if as_json:
-        _print_json(policies)
+        print_json(policies)
         return
-    columns = ("ghn_seed", "split", "success_at_end", "success_once", "return", "episodes")
-    _print_table(columns, [tuple(_text(policy[column]) for column in columns) for policy in policies])
+    print_rows(policies, ("ghn_seed", "split", *files.SCORES, "episodes"))
 
 
 @app.command
-def download(task: str = "PickCube-v1", *, folder: Path | None = None, dry_run: bool = False) -> None:
-    """Make a zoo's shards from the GHNs that nnit embeds; what is there already is kept.
+def download(
+    task: str = "PickCube-v1",
+    *,
+    split: list[Split] | None = None,
+    source: Annotated[str | None, Parameter(env_var="NNIT_ZOO_SOURCE")] = None,
+    revision: str | None = None,
+    folder: Path | None = None,
+    dry_run: bool = False,
+    as_json: Json = False,
+) -> None:
+    """Bring a zoo to this machine: from a source, or made from the GHNs that nnit embeds, with the same bytes.
+
+    What is there already is kept; after an interruption, run it again.
 
     Args:
         task: Name of the task.
+        split: Only the shards with policies of this split; may be given several times.
+        source: A data set of the Hub (owner/name or hf://datasets/owner/name), or a folder.
+        revision: Branch, tag or commit of the data set.
         folder: Where to write, instead of the cache of huggingface_hub.
         dry_run: Only say what would be written.
+        as_json: Print JSON.
     """
     from nnit_zoo import files
+    from nnit_zoo.display import Display
 
-    source = files.embedded(task)
-    manifest = files.Manifest.read(source)
+    manifest, index, bring = _provider(task, source, revision, folder)
     target = files.default_folder(task) if folder is None else folder
+    splits = split or files.SPLITS
+    wanted = files.shards_of(index, splits)
     if dry_run:
-        missing = manifest.missing(target)
-        size = files.readable(sum(entry.size for entry in missing.values()))
-        sys.stdout.write(f"{target}: {len(missing)} of {len(manifest.files)} files to write, {size}; ")
-        sys.stdout.write(f"{files.readable(files.free_bytes(target))} free\n")
+        missing = manifest.missing(target, wanted | {files.INDEX})
+        size, free = sum(entry.size for entry in missing.values()), files.free_bytes(target)
+        if as_json:
+            counts = {"files": len(wanted) + 1, "missing": len(missing), "missing_bytes": size, "free_bytes": free}
+            print_json({"task": task, "folder": str(target), **counts})
+        else:
+            sys.stdout.write(f"{target}: {len(missing)} of {len(wanted) + 1} files to write, {files.readable(size)}; ")
+            sys.stdout.write(f"{files.readable(free)} free\n")
         return
-    from nnit_zoo.materialise import materialise
-
-    with _progress(f"making {task}", len(manifest.shards)) as progress:
-        materialise(source, target, progress)
-    sys.stdout.write(f"{target}\n")
+    with Display(quiet=False).stage(f"{'fetching' if source else 'making'} {task}", len(wanted)) as tell:
+        bring(target, tell, splits)
+    if as_json:
+        print_json({"task": task, "folder": str(target)})
+    else:
+        sys.stdout.write(f"{target}\n")
 
 
 @app.command
-def verify(task: str = "PickCube-v1", *, folder: Path | None = None, as_json: Json = False) -> None:
+def verify(
+    task: str = "PickCube-v1",
+    *,
+    split: list[Split] | None = None,
+    deep: int = 0,
+    folder: Path | None = None,
+    as_json: Json = False,
+) -> None:
     """Check every file and every policy of a downloaded zoo.
 
     Args:
         task: Name of the task.
+        split: Only the shards with policies of this split; may be given several times.
+        deep: Also score this many policies anew, on the episodes of the build, and compare with the index.
         folder: Where the zoo is, if not in the cache of huggingface_hub.
         as_json: Print JSON.
     """
-    from nnit_zoo import files
-    from nnit_zoo.verify import verify as find_problems
+    from nnit_zoo import files, tasks
+    from nnit_zoo import verify as checks
+    from nnit_zoo.display import Display
     from nnit_zoo.zoo import locate
 
     place = locate(task, folder)
-    shards = len(files.Manifest.read(place).shards)
-    with _progress(f"checking {task}", shards) as progress:
-        problems = find_problems(place, progress)
+    splits = split or files.SPLITS
+    total = len(files.Manifest.read(place).shards)
+    with Display(quiet=False).stage(f"checking {task}", total) as tell:
+        problems = checks.verify(place, tell, splits)
+    scored: list[dict[str, Any]] = []
+    if deep and not problems:
+        episodes = deep * len(tasks.get(task).scoring_seeds)
+        with Display(quiet=False).stage(f"scoring {deep} policies", episodes) as tell:
+            scored = checks.rescore(place, deep, tell, splits)
+        problems = [f"{row['id']} scores otherwise than the index says" for row in scored if not row["agrees"]]
     if as_json:
-        _print_json({"task": task, "folder": str(place), "shards": shards, "problems": problems})
+        print_json({"task": task, "folder": str(place), "rescored": scored, "problems": problems})
     if problems:
         raise UserError("\n".join(problems))
     if not as_json:
-        sys.stdout.write(f"{task}: {shards} shards in {place} are sound\n")
+        if scored:
+            names = ("success_at_end", "return")
+            print_rows(scored, ("id", *(f"{when}_{name}" for name in names for when in ("stored", "now"))))
+        sys.stdout.write(f"{task}: the zoo in {place} is sound\n")
+
+
+@app.command
+def stats(
+    task: str = "PickCube-v1",
+    *,
+    architecture: list[str] | None = None,
+    output: Path | None = None,
+    folder: Path | None = None,
+    as_json: Json = False,
+) -> None:
+    """Measure how diverse and how aligned a zoo's policies are, next to the paper's numbers, with figures.
+
+    Args:
+        task: Name of the task.
+        architecture: Hidden widths to look at, three by default; may be given several times.
+        output: Folder for the figures; without it none are drawn.
+        folder: Where the zoo is, if not in the cache of huggingface_hub.
+        as_json: Print JSON.
+    """
+    from nnit_zoo import stats as analyses
+    from nnit_zoo.display import Display
+    from nnit_zoo.zoo import load
+
+    zoo = load(task, folder)
+    chosen = [zoo.parse(text) for text in architecture or analyses.ARCHITECTURES]
+    with Display(quiet=False).stage(f"analysing {task}", len(chosen) + len(zoo.architectures("seen"))) as tell:
+        measures = analyses.analyse(zoo, chosen, tell)
+    if output is not None:
+        for path in analyses.draw(zoo, chosen, output):
+            sys.stderr.write(f"{path}\n")
+    if as_json:
+        print_json(measures)
+    else:
+        print_rows(measures, tuple(measures[0]))
+
+
+@app.command
+def export(policy: str, output: Path, *, folder: Path | None = None, as_json: Json = False) -> None:
+    """Write policies for other software: a policy, an architecture, or the whole zoo of a task.
+
+    A policy (TASK/32-16-64-32/005) becomes a module that takes raw observations: .safetensors (state of an
+    nn.Sequential), .pt2 (torch.export) or .onnx. Of an architecture (TASK/32-16-64-32), .safetensors holds all policies
+    as stored. A zoo (TASK) becomes a folder that datasets.load_dataset reads.
+
+    Args:
+        policy: TASK, TASK/ARCHITECTURE or TASK/ARCHITECTURE/SEED.
+        output: File, whose suffix is the format, or folder.
+        folder: Where the zoo is, if not in the cache of huggingface_hub.
+        as_json: Print JSON.
+    """
+    from nnit_zoo.zoo import load
+
+    zoo = load(policy.partition("/")[0], folder)
+    if "/" in policy:
+        from nnit_zoo.export import export as write
+
+        write(zoo, policy, output)
+    else:
+        from nnit_zoo.card import write_dataset
+
+        write_dataset(output, [zoo])
+    if as_json:
+        print_json({"exported": policy, "output": str(output)})
+    else:
+        sys.stdout.write(f"{output}\n")
+
+
+@app.command
+def card(*, task: list[str] | None = None, as_json: Json = False) -> None:
+    """Print the README card of the data set that `export` and `push` write.
+
+    Args:
+        task: Only this task; may be given several times.
+        as_json: Print what the card says of each zoo as JSON.
+    """
+    from nnit_zoo import files
+
+    chosen = task or list(files.tasks_with_zoo())
+    if as_json:
+        print_json([files.describe(name) for name in chosen])
+        return
+    from nnit_zoo.card import readme
+
+    places = [files.embedded(name) for name in chosen]
+    sys.stdout.write(readme([(files.Manifest.read(place), files.read_index(place / files.INDEX)) for place in places]))
+
+
+@app.command
+def push(repository: str, *, task: list[str] | None = None, folder: Path | None = None, as_json: Json = False) -> None:
+    """Upload downloaded zoos, as one data set, to the Hub; log in first with `hf auth login`.
+
+    The data set is made, and public, unless it is there already.
+
+    Args:
+        repository: owner/name of the data set.
+        task: Only this task; may be given several times.
+        folder: Where the zoo is, if not in the cache of huggingface_hub.
+        as_json: Print JSON.
+    """
+    from tempfile import TemporaryDirectory
+
+    from nnit_zoo import files, hub
+    from nnit_zoo.card import write_dataset
+    from nnit_zoo.zoo import load
+
+    zoos = [load(name, folder) for name in task or files.tasks_with_zoo()]
+    with TemporaryDirectory() as place:
+        write_dataset(Path(place), zoos, repository)
+        commit = hub.push(repository, Path(place))
+    if as_json:
+        print_json({"repository": repository, "commit": commit})
+    else:
+        sys.stdout.write(f"{commit}\n")
 
 
 def run(application: App) -> None:
@@ -141,6 +303,11 @@ def run(application: App) -> None:
     except (UserError, CycloptsError) as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(2)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
+            raise
+        sys.stderr.write(f"error: cannot write {error.filename}: {error.strerror}\n")
+        sys.exit(2)
 
 
 def main() -> None:
@@ -148,64 +315,44 @@ def main() -> None:
     run(app)
 
 
-def _describe(task: str) -> dict[str, Any]:
-    """A zoo's splits with their sizes and mean scores, from the embedded index."""
+def _provider(
+    task: str, source: str | None, revision: str | None, folder: Path | None
+) -> tuple[Manifest, pa.Table, Callable[[Path, Callable[[int], None], Collection[str]], None]]:
+    """A zoo's manifest and index, and what brings its shards: the source if there is one, else the embedded GHNs."""
     from nnit_zoo import files
 
-    manifest = files.Manifest.read(files.embedded(task))
-    index = files.read_index(files.embedded(task) / files.INDEX)
-    splits: dict[str, list[dict[str, Any]]] = {}
-    for row in index.to_pylist():
-        splits.setdefault(row["split"], []).append(row)
-    place = files.default_folder(task)
-    return {
-        "task": task,
-        "inputs": manifest.inputs,
-        "outputs": manifest.outputs,
-        "policies": index.num_rows,
-        "bytes": manifest.size,
-        "folder": str(place),
-        "downloaded": (place / files.MANIFEST).is_file() and files.Manifest.read(place) == manifest,
-        "splits": {
-            split: {
-                "architectures": len({row["architecture"] for row in rows}),
-                "policies": len(rows),
-                **{
-                    score: sum(row[score] for row in rows) / len(rows)
-                    for score in ("success_at_end", "success_once", "return")
-                },
-            }
-            for split, rows in splits.items()
-        },
-    }
+    if source is None:
+        if revision:
+            raise UserError("--revision says which version of a --source: give both")
+        embedded = files.embedded(task)
+
+        def make(target: Path, progress: Callable[[int], None], splits: Collection[str]) -> None:
+            from nnit_zoo.materialise import materialise
+
+            materialise(embedded, target, progress, splits)
+
+        return files.Manifest.read(embedded), files.read_index(embedded / files.INDEX), make
+    from io import BytesIO
+
+    from nnit_zoo.hub import Source
+
+    found = Source(source, task, revision)
+    if folder is None and found.manifest != files.Manifest.read(files.embedded(task)):
+        raise UserError(f"{source} holds another version of the zoo than this nnit; keep it elsewhere with --folder")
+    return found.manifest, files.read_index(BytesIO(found.index)), found.fetch
 
 
-def _print_json(content: Any) -> None:
-    sys.stdout.write(json.dumps(content, indent=2) + "\n")
+def _layout(task: str) -> dict[str, str]:
+    """Which entries of the observation hold what, for a task that names them: `{"obj_pose": "29-35"}`."""
+    from nnit_zoo import tasks
+
+    entries, start = {}, 0
+    for name, size in getattr(tasks.get(task), "layout", {}).items():
+        entries[name] = f"{start}-{start + size - 1}" if size > 1 else f"{start}"
+        start += size
+    return entries
 
 
-def _text(value: Any) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
-
-
-def _print_table(columns: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(*columns, box=SIMPLE)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
-
-
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar on stderr, if that is a terminal; yields the function that advances it."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        line = bar.add_task(what, total=total)
-        yield lambda done: bar.advance(line, done)
+def _downloaded(zoo: dict[str, Any]) -> str:
+    here, all_ = zoo["shards_downloaded"], zoo["shards"]
+    return "no" if not here else "yes" if here == all_ else f"{here} of {all_} shards"

@@ -7,11 +7,14 @@ beside the GHNs from which the shards are made.
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import io
 import shlex
 import shutil
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -19,8 +22,13 @@ import pyarrow.parquet as pq
 from huggingface_hub import cached_assets_path
 from pydantic import BaseModel, Field, ValidationError
 
+from nnit_zoo import architecture as known
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.errors import UserError, unknown_name
 
+SPLITS = (*known.SPLITS, "heldout_seed")
+SCORES = ("success_at_end", "success_once", "return")
+Progress = Callable[[int], None]
 EMBEDDED = Path(__file__).parent / "data"
 INDEX = "index.parquet"
 MANIFEST = "manifest.json"
@@ -66,7 +74,7 @@ class Manifest(BaseModel):
     inputs: int
     outputs: int
     index: Entry
-    shards: dict[str, Entry]
+    shards: dict[Annotated[str, Field(pattern=r"^\d+(-\d+)*\.safetensors$")], Entry]
 
     @classmethod
     def read(cls, folder: Path) -> Manifest:
@@ -87,9 +95,10 @@ class Manifest(BaseModel):
         """The content of manifest.json, the same bytes for the same manifest."""
         return (self.model_dump_json(indent=2, by_alias=True) + "\n").encode()
 
-    def missing(self, folder: Path) -> dict[str, Entry]:
-        """The files that `folder` lacks or holds in another form."""
-        return {name: entry for name, entry in self.files.items() if not entry.describes(folder / name)}
+    def missing(self, folder: Path, names: Collection[str]) -> dict[str, Entry]:
+        """Of these files, those that `folder` lacks or holds in another form."""
+        wanted = ((name, entry) for name, entry in self.files.items() if name in names)
+        return {name: entry for name, entry in wanted if not entry.describes(folder / name)}
 
     @property
     def files(self) -> dict[str, Entry]:
@@ -102,16 +111,86 @@ class Manifest(BaseModel):
         return sum(entry.size for entry in self.files.values())
 
 
+def fill(
+    target: Path,
+    manifest: Manifest,
+    index: bytes,
+    produce: Callable[[Collection[str]], Iterator[tuple[str, bytes]]],
+    *,
+    splits: Collection[str],
+    progress: Progress | None,
+    advice: str,
+) -> None:
+    """Write the shards of these splits that `target` lacks, then the index, then, as the mark of a zoo, the manifest.
+
+    `produce` gives name and content of each shard that it is asked for. `progress` is called with the number of newly
+    finished shards. May be killed and run again, also by two processes at once. Raises UserError if the disk is full,
+    the folder cannot be written, or, with this `advice`, a content is not what the manifest promises.
+    """
+    wanted = shards_of(read_index(io.BytesIO(index)), splits)
+    missing = manifest.missing(target, wanted)
+    if progress:
+        progress(len(wanted) - len(missing))
+    unwritten = sum(entry.size for entry in missing.values()) + len(index)
+    for name, content in produce(missing.keys()) if missing else ():
+        if Entry.of(content) != missing[name]:
+            raise UserError(f"{name} is not what the manifest promises: {advice}")
+        _write(target / name, content, unwritten)
+        unwritten -= len(content)
+        if progress:
+            progress(1)
+    _write(target / INDEX, index, unwritten)
+    _write(target / MANIFEST, manifest.to_bytes(), unwritten)
+
+
+def _write(path: Path, content: bytes, needed: int) -> None:
+    """Write a file of a zoo, with advice if that fails; `needed` is what remains to be written, in bytes."""
+    try:
+        write_bytes(path, content)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise UserError(
+                f"no space left in {path.parent}: {needed} bytes ({readable(needed)}) are still to be written; "
+                "make room and run the same command again, or choose another folder with --folder"
+            ) from None
+        raise UserError(
+            f"cannot write in {path.parent} ({error.strerror}); choose another folder with --folder"
+        ) from None
+
+
+def shards_of(index: pa.Table, splits: Collection[str]) -> set[str]:
+    """The names of the shards that hold policies of these splits; raises UserError for an unknown split."""
+    for split in splits:
+        if split not in SPLITS:
+            raise unknown_name("split", split, SPLITS)
+    rows = index.filter(pc.is_in(index["split"], pa.array(splits, pa.string())))
+    return set(pc.unique(rows["shard"]).to_pylist())
+
+
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file, as hexadecimal text."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_index(path: Path, architecture: str | None = None) -> pa.Table:
+def read_index(path: Path | io.BytesIO, architecture: str | None = None) -> pa.Table:
     """The rows of an index file, of one architecture if given; columns as in INDEX_SCHEMA."""
     table = pq.ParquetFile(path).read()
     return table if architecture is None else table.filter(pc.equal(table["architecture"], architecture))
+
+
+def summary(index: pa.Table) -> dict[str, dict[str, Any]]:
+    """Per split its numbers of architectures and policies and the mean scores of these, None where a task has none."""
+    counts = [("architecture", "count_distinct"), ("id", "count"), *((score, "mean") for score in SCORES)]
+    rows = index.group_by("split", use_threads=False).aggregate(counts).to_pylist()
+    return {
+        row["split"]: {
+            "architectures": row["architecture_count_distinct"],
+            "policies": row["id_count"],
+            **{score: row[f"{score}_mean"] for score in SCORES},
+        }
+        for row in sorted(rows, key=lambda row: SPLITS.index(row["split"]))
+    }
 
 
 def tasks_with_zoo() -> tuple[str, ...]:
@@ -124,6 +203,25 @@ def embedded(task: str) -> Path:
     if task not in tasks_with_zoo():
         raise unknown_name("zoo", task, tasks_with_zoo())
     return EMBEDDED / task
+
+
+def describe(task: str) -> dict[str, Any]:
+    """What there is to say of an embedded zoo: sizes, where it lies, how much of it is there, and its summary."""
+    manifest = Manifest.read(embedded(task))
+    index = read_index(embedded(task) / INDEX)
+    place = default_folder(task)
+    ours = (place / MANIFEST).is_file() and Manifest.read(place) == manifest
+    return {
+        "task": task,
+        "inputs": manifest.inputs,
+        "outputs": manifest.outputs,
+        "policies": index.num_rows,
+        "bytes": manifest.size,
+        "folder": str(place),
+        "shards": len(manifest.shards),
+        "shards_downloaded": sum((place / name).is_file() for name in manifest.shards) if ours else 0,
+        "splits": summary(index),
+    }
 
 
 def default_folder(task: str) -> Path:

@@ -1,18 +1,20 @@
 """Make a zoo's shards from its embedded GHNs: the same bytes on every machine, proved by the manifest.
 
 The GHNs decode in float64 and every parameter is rounded once to float16. Thread counts, processors and versions of
-BLAS sum in different orders, which moves a float64 parameter by about 1e-16; its float16 bytes only change if that
-carries it across a rounding tie. `write_manifest` refuses a zoo with a parameter that close to one, so none does.
+BLAS sum in different orders, which moves a float64 parameter by about 1e-16. Its float16 bytes change only if that
+carries it across a rounding tie. Hardly any parameter is that close to one, and for those the index's hash of the
+policy tells which side is the stored one.
 """
 
 from __future__ import annotations
 
-import errno
+import hashlib
 import io
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Collection, Iterator, Sequence
 from copy import deepcopy
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,54 +26,62 @@ from safetensors import SafetensorError, safe_open
 
 from nnit_zoo import files
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.build.files import write_atomically
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import Entry, Manifest
+from nnit_zoo.files import SPLITS, Entry, Manifest, Progress
 from nnit_zoo.policy import PolicyBatch, concatenate
-from nnit_zoo.zoo import HELDOUT_SEEDS_FROM, SPLITS, policy_hashes
+from nnit_zoo.zoo import HELDOUT_SEEDS_FROM, policy_hashes
 
 GHNS = "ghns.safetensors"
 SELECTION = "selection.parquet"
 TIE_MARGIN = 1e-14
+_MOST_TIES = 8  # of one policy that are tried on both sides
 
 
-def materialise(data_folder: Path, target: Path, progress: Callable[[int], None] | None = None) -> None:
-    """Write the zoo that `data_folder` embeds to `target`; shards that are there already are kept.
+def materialise(
+    data_folder: Path, target: Path, progress: Progress | None = None, splits: Collection[str] = SPLITS
+) -> None:
+    """Write the shards of these splits of the zoo that `data_folder` embeds to `target`, as `files.fill` does.
 
-    `progress` is called with the number of newly finished shards. May be killed and run again, also by two processes
-    at once. Raises UserError if the disk is full, the folder cannot be written, or a shard comes out different from
-    the manifest.
+    Shards that are there already are kept. Raises UserError if a shard comes out different from the manifest.
     """
     manifest = Manifest.read(data_folder)
-    index = (data_folder / files.INDEX).read_bytes()
-    tell = progress or (lambda shards: None)
-    missing = manifest.shards.keys() & manifest.missing(target).keys()
-    tell(len(manifest.shards) - len(missing))
-    source = _Source(data_folder)
-    for architecture in source.rows:
-        name = _shard_name(architecture)
-        if name in missing:
-            content = _serialise(_round(source.decode(architecture)), source.task)
-            _check_promised(content, manifest.shards[name], target / name)
-            _write(target / name, content, manifest)
-            tell(1)
-    _write(target / files.INDEX, index, manifest)
-    _write(target / files.MANIFEST, manifest.to_bytes(), manifest)  # last: it says that the zoo is complete
+
+    def make(names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        source = _Source(data_folder)
+        for architecture in source.rows:
+            if (name := _shard_name(architecture)) in names:
+                exact = source.decode(architecture)
+                content = _serialise(_round(exact), source.task)
+                if Entry.of(content) != manifest.shards[name]:
+                    rows = files.read_index(data_folder / files.INDEX, str(architecture))
+                    content = _serialise(_turn_ties(exact, rows["sha256"].to_pylist()), source.task)
+                yield name, content
+
+    files.fill(
+        target,
+        manifest,
+        (data_folder / files.INDEX).read_bytes(),
+        make,
+        splits=splits,
+        progress=progress,
+        advice=f"it came out different here (torch {torch.__version__}), so the embedded GHNs are damaged; install "
+        "nnit again, and if that does not help, please report it",
+    )
 
 
 def write_manifest(data_folder: Path) -> None:
     """Write index.parquet and manifest.json beside the GHNs and the selection table that they follow from.
 
-    Raises UserError if a kept policy has a parameter that is not finite in float16, or within TIE_MARGIN of a rounding
-    tie, where machines could disagree.
+    Raises UserError if a kept policy has a parameter that is not finite in float16.
     """
     source = _Source(data_folder)
     shards, index = {}, []
     for architecture, rows in source.rows.items():
-        exact, ids = source.decode(architecture), source.ids(architecture)
-        batch = _round(exact)
-        _check_faithful(exact, batch, ids)
+        batch, ids = _round(source.decode(architecture)), source.ids(architecture)
+        if not batch.finite().all():
+            raise UserError(f"{ids[int(batch.finite().int().argmin())]} is not finite in float16: do not keep it")
         name = _shard_name(architecture)
         shards[name] = Entry.of(_serialise(batch, source.task))
         stored = zip(rows, ids, policy_hashes(batch), strict=True)
@@ -88,8 +98,8 @@ def write_manifest(data_folder: Path) -> None:
         index=Entry.of(buffer.getvalue()),
         shards=shards,
     )
-    _put(data_folder / files.INDEX, buffer.getvalue())
-    _put(data_folder / files.MANIFEST, manifest.to_bytes())
+    write_bytes(data_folder / files.INDEX, buffer.getvalue())
+    write_bytes(data_folder / files.MANIFEST, manifest.to_bytes())
 
 
 def stored(ghn: GHN, architecture: Architecture) -> PolicyBatch:
@@ -143,16 +153,22 @@ def _round(exact: PolicyBatch) -> PolicyBatch:
     return PolicyBatch(exact.architecture, layers)
 
 
-def _check_faithful(exact: PolicyBatch, batch: PolicyBatch, ids: list[str]) -> None:
-    """Raise UserError for a policy that is not finite in float16, or that machines could round differently."""
-    if not batch.finite().all():
-        raise UserError(f"{ids[int(batch.finite().int().argmin())]} is not finite in float16: do not keep it")
-    values, nearest = exact.flat().numpy(), batch.flat().numpy()
-    for side in (np.inf, -np.inf):
-        neighbour = np.nextafter(nearest, np.float16(side)).astype(np.float64)
-        close = np.abs((nearest + neighbour) / 2 - values).min(axis=1) < TIE_MARGIN
-        if close.any():
-            raise UserError(f"{ids[int(close.argmax())]} has a parameter on a rounding tie of float16: do not keep it")
+def _turn_ties(exact: PolicyBatch, hashes: Sequence[str]) -> PolicyBatch:
+    """The rounded batch, with parameters on a tie turned to the other side where that gives a policy its hash."""
+    values, nearest = exact.flat().numpy(), _round(exact).flat().numpy()
+    other = np.nextafter(nearest, np.where(values > nearest, np.float16(np.inf), np.float16(-np.inf)))
+    ties = np.abs((nearest.astype(np.float64) + other) / 2 - values) < TIE_MARGIN
+    for policy, sha256 in enumerate(hashes):
+        columns = np.flatnonzero(ties[policy])[:_MOST_TIES]
+        sides = zip(nearest[policy, columns], other[policy, columns], strict=True)
+        for chosen in product(*sides):
+            nearest[policy, columns] = chosen
+            if hashlib.sha256(nearest[policy].tobytes()).hexdigest() == sha256:
+                break
+    sizes = [rows * columns for rows, columns in exact.architecture.block_shapes]
+    parts = torch.split(torch.from_numpy(nearest), sizes, dim=1)
+    layers = (part.view(-1, *shape) for part, shape in zip(parts, exact.architecture.block_shapes, strict=True))
+    return PolicyBatch(exact.architecture, tuple(layers))
 
 
 def _serialise(batch: PolicyBatch, task: str) -> bytes:
@@ -172,32 +188,3 @@ def _serialise(batch: PolicyBatch, task: str) -> bytes:
 
 def _shard_name(architecture: Architecture) -> str:
     return f"{architecture}.safetensors"
-
-
-def _check_promised(content: bytes, promised: Entry, path: Path) -> None:
-    if Entry.of(content) != promised:
-        raise UserError(
-            f"{path.name} comes out different from the manifest on this machine (torch {torch.__version__}): "
-            "the embedded GHNs are damaged, so install nnit again; if that does not help, please report it"
-        )
-
-
-def _put(path: Path, content: bytes) -> None:
-    def fill(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_atomically(path, fill)
-
-
-def _write(path: Path, content: bytes, manifest: Manifest) -> None:
-    folder = path.parent
-    try:
-        _put(path, content)
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            needed = sum(entry.size for entry in manifest.missing(folder).values())
-            raise UserError(
-                f"no space left in {folder}: {needed} bytes ({files.readable(needed)}) are still to be written; "
-                "make room and run the same command again, or choose another folder with --folder"
-            ) from None
-        raise UserError(f"cannot write in {folder} ({error.strerror}); choose another folder with --folder") from None

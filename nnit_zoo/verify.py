@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+import pyarrow.compute as pc
 import torch
 
-from nnit_zoo import files
+from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture, split_of
 from nnit_zoo.errors import UserError
-from nnit_zoo.zoo import HELDOUT_SEEDS_FROM, damaged, policy_hashes, read_shard
+from nnit_zoo.files import Progress
+from nnit_zoo.zoo import HELDOUT_SEEDS_FROM, Zoo, damaged, policy_hashes, read_shard
+
+TOLERANCE = 0.05  # of a score, or of 1 if that is more
 
 
-def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[str]:
+def verify(folder: Path, progress: Progress | None = None, splits: Collection[str] = files.SPLITS) -> list[str]:
     """What is wrong with the zoo in `folder`, a sentence per problem; empty if it is sound.
 
-    `progress` is called with the number of newly checked shards. Raises UserError if the folder has no
-    manifest that can be read.
+    Only shards with policies of these splits are looked for. `progress` is called with the number of newly checked
+    shards. Raises UserError if the folder has no manifest that can be read.
     """
     manifest = files.Manifest.read(folder)
     if not manifest.index.describes(folder / files.INDEX):
@@ -35,7 +39,9 @@ def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[
         problems.append(f"{folder / files.INDEX} lists a policy twice")
     for name in sorted(rows.keys() - manifest.shards.keys()):
         problems.append(f"{folder / files.INDEX} lists policies in {name}, which {files.MANIFEST} does not")
-    for name, entry in manifest.shards.items():
+    wanted = files.shards_of(index, splits)
+    for name in (name for name in manifest.shards if name in wanted):
+        entry = manifest.shards[name]
         architecture = Architecture.parse(Path(name).stem, manifest.inputs, manifest.outputs)
         if entry.describes(folder / name):
             problems += _shard_problems(folder / name, architecture, rows[name])
@@ -44,6 +50,34 @@ def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[
         if progress:
             progress(1)
     return problems
+
+
+def rescore(
+    folder: Path, count: int, progress: Progress | None = None, splits: Collection[str] = files.SPLITS
+) -> list[dict[str, Any]]:
+    """Play the build's episodes again with `count` policies, evenly spread over the index: a row for each.
+
+    A row has the policy's id, each of its scores as `stored_` and `now_`, and whether they agree. The same kind of
+    processor gives the same numbers; another may round otherwise and let a few episodes end otherwise. `progress` is
+    called with the number of newly finished episodes. Raises UserError as `Task.evaluate` does.
+    """
+    zoo = Zoo.open(folder)
+    zoo = zoo.filter(pc.field("split").isin(list(splits)))
+    task = tasks.get(zoo.task)
+    ids = zoo.index["id"].to_pylist()
+    count = min(count, len(ids))
+    chosen = [zoo[ids[len(ids) * number // count]] for number in range(count)]
+    table = task.evaluate([policy.weights for policy in chosen], task.scoring_seeds, progress=progress)
+    means = table.group_by("policy", use_threads=False).aggregate([(score, "mean") for score in files.SCORES])
+    rows = []
+    for policy, now in zip(chosen, means.sort_by("policy").to_pylist(), strict=True):
+        row = {"id": policy.record["id"], "agrees": True}
+        for score in files.SCORES:
+            before, after = policy.record[score], now[f"{score}_mean"]
+            row |= {f"stored_{score}": before, f"now_{score}": after}
+            row["agrees"] &= before is None or abs(after - before) <= TOLERANCE * max(before, 1)
+        rows.append(row)
+    return rows
 
 
 def _row_problems(row: dict[str, Any], task: str) -> list[str]:

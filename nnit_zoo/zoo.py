@@ -3,28 +3,49 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import torch
 from safetensors import SafetensorError, safe_open
+from torch import nn
 
-from nnit_zoo import architecture as known
-from nnit_zoo import files
+from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture, split_of
 from nnit_zoo.errors import UserError, unknown_name
+from nnit_zoo.files import SPLITS
 from nnit_zoo.policy import PolicyBatch
 
 HELDOUT_SEEDS_FROM = 128
-SPLITS = (*known.SPLITS, "heldout_seed")
+
+
+@dataclass(frozen=True)
+class Policy:
+    """One stored policy: its row of the index, and its weights as a batch of one."""
+
+    record: Mapping[str, Any]
+    weights: PolicyBatch
+
+    def to_module(self, *, raw: bool = False) -> nn.Sequential:
+        """The policy as a plain float32 nn.Sequential of Linear and Tanh.
+
+        It takes standardised observations; with `raw`, the task's standardisation is folded into its first layer.
+        """
+        if not raw:
+            return self.weights.to_module(0)
+        task = tasks.get(self.record["task"])
+        mean, std = torch.from_numpy(task.observation_mean), torch.from_numpy(task.observation_std)
+        return self.weights.to_module(0, mean, std)
 
 
 class Zoo:
     """The policies of one task in a folder; open one with `Zoo.open` or `nnit_zoo.load`.
 
+    Iterating gives every `Policy` in index order, and `zoo["PickCube-v1/32-16-64-32/005"]` the one with that id.
     `index` has a row per policy: id, task, architecture, ghn_seed, split, success_once, success_at_end, return,
     episodes, shard, row, sha256. `split` is `seen`, `unseen`, `excluded`, or `heldout_seed` for GHN seeds from 128 on.
     """
@@ -52,12 +73,34 @@ class Zoo:
     def __len__(self) -> int:
         return int(self.index.num_rows)
 
+    def __iter__(self) -> Iterator[Policy]:
+        return (self._policy(record) for batch in self.index.to_batches() for record in batch.to_pylist())
+
+    def __getitem__(self, policy: str) -> Policy:
+        """The policy with this id; raises UserError if there is none."""
+        rows = self.index.filter(pc.equal(self.index["id"], policy)).to_pylist()
+        if not rows:
+            raise unknown_name("policy", policy, self.index["id"].to_pylist())
+        return self._policy(rows[0])
+
+    def filter(self, condition: pc.Expression) -> Zoo:
+        """The zoo of the policies for which a condition on index columns holds.
+
+        An example is `zoo.filter(pc.field("return") > 39)` with `import pyarrow.compute as pc`. Raises UserError for a
+        condition that the index cannot answer.
+        """
+        try:
+            rows = self.index.filter(condition)
+        except pa.ArrowException as error:
+            raise UserError(f"cannot filter by {condition}: {error}") from None
+        return Zoo(self.folder, self.manifest, rows)
+
     def architectures(self, split: str) -> tuple[Architecture, ...]:
         """The architectures that have policies in `split`, in index order; raises UserError for an unknown split."""
         if split not in SPLITS:
             raise unknown_name("split", split, SPLITS)
         rows = self.index.filter(pc.equal(self.index["split"], split))
-        return tuple(self._parse(text) for text in pc.unique(rows["architecture"]).to_pylist())
+        return tuple(self.parse(text) for text in pc.unique(rows["architecture"]).to_pylist())
 
     def batch(self, architecture: Architecture | str, split: str | None = None) -> PolicyBatch:
         """The policies of an architecture in one split, or in all, as stored: float16, memory-mapped, in index order.
@@ -66,7 +109,8 @@ class Zoo:
         """
         rows = self._rows(str(architecture), split)["row"].to_pylist()
         # An architecture's rows are sorted by GHN seed, so those of a split are neighbours: a slice stays mapped.
-        return self._shard(str(architecture))[rows[0] : rows[-1] + 1]
+        together = rows[-1] - rows[0] == len(rows) - 1
+        return self._shard(str(architecture))[slice(rows[0], rows[-1] + 1) if together else rows]
 
     def ghn_seeds(self, architecture: Architecture | str, split: str | None = None) -> tuple[int, ...]:
         """The GHN seed of each policy of `batch(architecture, split)`."""
@@ -91,7 +135,12 @@ class Zoo:
         seeds = {architecture: self.ghn_seeds(architecture, split) for architecture in architectures}
         return TrainingView(self.task, batches, seeds, reference)
 
-    def _parse(self, text: str) -> Architecture:
+    def _policy(self, record: dict[str, Any]) -> Policy:
+        row = record["row"]
+        return Policy(record, self._shard(record["architecture"])[row : row + 1])
+
+    def parse(self, text: str) -> Architecture:
+        """The architecture with these hidden widths and the zoo's inputs and outputs."""
         return Architecture.parse(text, self.manifest.inputs, self.manifest.outputs)
 
     def _rows(self, architecture: str, split: str | None) -> pa.Table:
@@ -112,7 +161,7 @@ class Zoo:
             path = self.folder / name
             if not self.manifest.shards[name].describes(path):
                 raise damaged(path, self.task)
-            self._shards[architecture] = read_shard(path, self._parse(architecture))
+            self._shards[architecture] = read_shard(path, self.parse(architecture))
         return self._shards[architecture]
 
 

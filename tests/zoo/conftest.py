@@ -1,10 +1,21 @@
-"""A tiny zoo from untrained GHNs: two training seeds and a held-out one, three architectures, one policy dropped."""
+"""A tiny zoo from untrained GHNs: two training seeds and a held-out one, four architectures, one policy dropped.
+
+And a stand-in for the Hub: the endpoints that huggingface_hub uses for data sets, on a port of this machine.
+"""
 
 from __future__ import annotations
 
+import base64
 import json
+import re
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
 
+import huggingface_hub
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -20,20 +31,22 @@ ARCHITECTURES = {"32-16-64-32": "seen", "64-64-64-32": "seen", "16-16-16-32": "u
 DROPPED = ("64-64-64-32", 1)
 
 
-def make_data_folder(folder: Path, task: str = "PickCube-v1") -> Path:
+def make_data_folder(folder: Path, task: str = "PickCube-v1", inputs: int = 42, outputs: int = 8) -> Path:
+    """A task's embedded folder; MNIST-PCA32 has an accuracy in `return` and no notion of success."""
     folder.mkdir(parents=True)
-    states = [GHN(42, 8, seed).state_dict() for seed in SEEDS]
+    states = [GHN(inputs, outputs, seed).state_dict() for seed in SEEDS]
     stacked = {name: torch.stack([state[name] for state in states]).half() for name in states[0]}
-    metadata = {"task": task, "inputs": 42, "outputs": 8, "ghn_seeds": SEEDS}
+    metadata = {"task": task, "inputs": inputs, "outputs": outputs, "ghn_seeds": SEEDS}
     save_file(stacked, folder / "ghns.safetensors", {"nnit": json.dumps(metadata)})
+    robot = task != "MNIST-PCA32"
     rows = [
         {
             "architecture": architecture,
             "ghn_seed": seed,
             "split": split,
-            "success_once": 1.0,
-            "success_at_end": 0.75 + seed / 512,
-            "return": 38.0,
+            "success_once": 1.0 if robot else None,
+            "success_at_end": 0.75 + seed / 512 if robot else None,
+            "return": 38.0 if robot else 0.96,
             "episodes": 64,
             "kept": (architecture, seed) != DROPPED,
         }
@@ -50,6 +63,14 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_data_folder(tmp_path_factory.mktemp("embedded") / "PickCube-v1")
 
 
+@pytest.fixture(scope="session")
+def made_once(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny zoo, for tests that only read it."""
+    folder = tmp_path_factory.mktemp("made") / "zoo"
+    materialise(data_folder, folder)
+    return folder
+
+
 @pytest.fixture
 def zoo_folder(data_folder: Path, tmp_path: Path) -> Path:
     materialise(data_folder, tmp_path / "zoo")
@@ -62,3 +83,124 @@ def home(data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(files, "EMBEDDED", data_folder.parent)
     monkeypatch.setattr(files, "cached_assets_path", (tmp_path / "home").joinpath)
     return tmp_path / "home"
+
+
+class Hub(ThreadingHTTPServer):
+    """Data sets in memory. `cut` holds how often an answer with this file breaks off in the middle.
+
+    While it is `closed`, nobody may write.
+    """
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.files: dict[str, dict[str, bytes]] = {}
+        self.cut: dict[str, int] = {}
+        self.asked: list[str] = []
+        self.closed = False
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Hub
+    protocol_version = "HTTP/1.1"
+    sha = "0123456789abcdef0123456789abcdef01234567"
+
+    def do_GET(self) -> None:
+        path = unquote(urlsplit(self.path).path)
+        self.server.asked.append(path)
+        if match := re.fullmatch(r"/api/datasets/([^/]+/[^/]+)(?:/revision/(.+))?", path):
+            self.give_repository(match[1], match[2] or "main")
+        elif match := re.fullmatch(r"/datasets/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", path):
+            self.give_file(match[1], match[3])
+        else:
+            self.answer(404, {"error": "no such page"})
+
+    do_HEAD = do_GET
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        path = urlsplit(self.path).path
+        if self.server.closed:
+            self.answer(401, {"error": "Invalid username or password."})
+        elif path == "/api/repos/create":
+            wanted = json.loads(body)
+            repository = f"{wanted.get('organization')}/{wanted['name']}"
+            self.server.files.setdefault(repository, {})
+            self.answer(200, {"url": f"{self.server.address}/datasets/{repository}"})
+        elif path == "/api/validate-yaml":
+            self.answer(200, {"errors": [], "warnings": []})
+        elif match := re.fullmatch(r"/api/datasets/(.+)/preupload/main", path):
+            names = [file["path"] for file in json.loads(body)["files"]]
+            modes = [{"path": name, "uploadMode": "regular", "shouldIgnore": False} for name in names]
+            self.answer(200, {"files": modes})
+        elif match := re.fullmatch(r"/api/datasets/(.+)/commit/main", path):
+            for line in body.splitlines():
+                operation = json.loads(line)
+                if operation["key"] == "file":
+                    value = operation["value"]
+                    self.server.files[match[1]][value["path"]] = base64.b64decode(value["content"])
+            address = f"{self.server.address}/datasets/{match[1]}/commit/{self.sha}"
+            self.answer(200, {"commitUrl": address, "commitOid": self.sha, "hookOutput": ""})
+        else:
+            self.answer(404, {"error": path})
+
+    def give_repository(self, repository: str, revision: str) -> None:
+        if repository not in self.server.files:
+            self.answer(404, {"error": "Repository not found"}, {"X-Error-Code": "RepoNotFound"})
+        elif revision not in ("main", self.sha):
+            self.answer(404, {"error": "Invalid rev id"}, {"X-Error-Code": "RevisionNotFound"})
+        else:
+            names = [{"rfilename": name} for name in self.server.files[repository]]
+            self.answer(200, {"id": repository, "sha": self.sha, "siblings": names, "private": False})
+
+    def give_file(self, repository: str, name: str) -> None:
+        content = self.server.files.get(repository, {}).get(name)
+        if content is None:
+            self.answer(404, {"error": "Entry not found"}, {"X-Error-Code": "EntryNotFound"})
+            return
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        if self.server.cut.get(name, 0):
+            self.server.cut[name] -= 1
+            content = content[: len(content) // 2]
+            self.close_connection = True
+        self.wfile.write(content)
+
+    def answer(self, status: int, content: dict[str, Any], headers: dict[str, str] | None = None) -> None:
+        body = json.dumps(content).encode()
+        self.send_response(status)
+        sent = {"Content-Type": "application/json", "Content-Length": str(len(body))} | (headers or {})
+        for name, value in sent.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        return
+
+
+def point_at(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What HF_ENDPOINT does when huggingface_hub is imported."""
+    template = f"{address}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+    monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", address)
+    monkeypatch.setattr(huggingface_hub.constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+
+
+@pytest.fixture
+def hub(made_once: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    """The stand-in, with the tiny zoo in the data set `someone/zoo`."""
+    server = Hub()
+    server.files["someone/zoo"] = {f"PickCube-v1/{path.name}": path.read_bytes() for path in made_once.iterdir()}
+    point_at(server.address, monkeypatch)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    yield server
+    server.shutdown()
+    server.server_close()
+    thread.join()

@@ -1,15 +1,24 @@
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
+from matplotlib.image import imread
 
-from nnit_zoo.cli import main
+from nnit_zoo import export, files
+from nnit_zoo.cli import app, main
+from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.tasks.pick_cube import PickCube
+from nnit_zoo.zoo import Zoo
+
+from .conftest import make_data_folder
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]
@@ -34,7 +43,7 @@ def nnit_zoo(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 def assert_error(result: Result, *parts: str) -> None:
     code, stdout, stderr = result
     assert (code, stdout) == (2, "")
-    assert stderr.startswith("error: ")
+    assert "\nerror: " in f"\n{stderr}"
     for part in parts:
         assert part in stderr
 
@@ -66,10 +75,12 @@ def test_a_mistake_exits_with_2_and_no_traceback(arguments: tuple[str, ...]) -> 
 
 def test_list_and_show_need_no_download(nnit_zoo: Command) -> None:
     (zoo,) = json.loads(nnit_zoo("list", "--json")[1])
-    assert (zoo["task"], zoo["policies"], zoo["downloaded"]) == ("PickCube-v1", 11, False)
+    assert (zoo["task"], zoo["policies"], zoo["shards"], zoo["shards_downloaded"]) == ("PickCube-v1", 11, 4, 0)
     assert zoo["splits"]["seen"]["policies"] == 3
     assert "PickCube-v1" in nnit_zoo("list")[1]
-    assert json.loads(nnit_zoo("show", "PickCube-v1", "--json")[1]) == zoo
+    shown = json.loads(nnit_zoo("show", "PickCube-v1", "--json")[1])
+    assert shown == zoo | {"layout": shown["layout"]}
+    assert shown["layout"]["obj_pose"] == "29-35"
     assert "heldout_seed" in nnit_zoo("show")[1]
     policies = json.loads(nnit_zoo("show", "--architecture", "64-64-64-32", "--json")[1])
     assert [policy["id"] for policy in policies] == ["PickCube-v1/64-64-64-32/000", "PickCube-v1/64-64-64-32/128"]
@@ -83,8 +94,8 @@ def test_download_then_verify_then_mend(nnit_zoo: Command, home: Path) -> None:
 
     assert nnit_zoo("download", "--task", "PickCube-v1")[:2] == (0, f"{folder}\n")
     assert "0 of 5 files to write" in nnit_zoo("download", "--dry-run")[1]
-    assert "4 shards" in nnit_zoo("verify")[1]
-    assert json.loads(nnit_zoo("list", "--json")[1])[0]["downloaded"]
+    assert "is sound" in nnit_zoo("verify")[1]
+    assert json.loads(nnit_zoo("list", "--json")[1])[0]["shards_downloaded"] == 4
 
     (folder / "16-16-16-32.safetensors").write_bytes(b"")
     code, stdout, _ = nnit_zoo("verify", "--json")
@@ -95,9 +106,117 @@ def test_download_then_verify_then_mend(nnit_zoo: Command, home: Path) -> None:
     assert json.loads(nnit_zoo("verify", "--json")[1])["problems"] == []
 
 
+def test_a_split_can_be_downloaded_and_verified_alone(nnit_zoo: Command) -> None:
+    plan = json.loads(nnit_zoo("download", "--split", "unseen", "--dry-run", "--json")[1])
+    assert (plan["files"], plan["missing"]) == (2, 2)
+    assert nnit_zoo("download", "--split", "unseen", "--split", "excluded")[0] == 0
+    assert "2 of 4 shards" in nnit_zoo("list")[1]
+    assert nnit_zoo("verify", "--split", "unseen")[0] == 0
+    assert_error(nnit_zoo("verify"), "32-16-64-32.safetensors is missing")
+
+
+def test_a_source_with_another_version_does_not_replace_the_zoo(
+    nnit_zoo: Command, zoo_folder: Path, home: Path, tmp_path: Path
+) -> None:
+    assert nnit_zoo("download", "--source", str(zoo_folder))[:2] == (0, f"{home / 'nnit' / 'zoo' / 'PickCube-v1'}\n")
+    manifest = files.Manifest.read(zoo_folder)
+    manifest.shards.pop("16-16-16-32.safetensors")
+    (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
+    assert_error(nnit_zoo("download", "--source", str(zoo_folder)), "another version of the zoo", "--folder")
+
+
+def test_deep_verification_scores_a_sample_anew(nnit_zoo: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert nnit_zoo("download")[0] == 0
+    asked: list[int] = []
+    success = [1.0] * 64
+
+    def evaluate(task: object, policies: Sequence[PolicyBatch], seeds: Sequence[int], **_: object) -> pa.Table:
+        asked.append(sum(map(len, policies)))
+        count = asked[-1]
+        columns = {"success_once": [1.0] * 64, "success_at_end": success, "return": [38.0] * 64}
+        return pa.table(
+            {"policy": [i for i in range(count) for _ in seeds]} | {k: v * count for k, v in columns.items()}
+        )
+
+    monkeypatch.setattr(PickCube, "evaluate", evaluate)
+    result = json.loads(nnit_zoo("verify", "--deep", "3", "--json")[1])
+    # the tiny zoo's index says 0.75 for seed 0 and 1.0 for seed 128
+    rescored = {row["id"].removeprefix("PickCube-v1/"): row["agrees"] for row in result["rescored"]}
+    assert rescored == {"32-16-64-32/000": False, "64-64-64-32/000": False, "16-16-16-32/128": True}
+    assert len(result["problems"]) == 2
+    success[:16] = [0.0] * 16
+    assert_error(nnit_zoo("verify", "--deep", "20"), "/128 scores otherwise than the index says")
+    assert asked == [3, 11]
+
+
+def test_stats_are_printed_beside_the_papers_numbers(nnit_zoo: Command, tmp_path: Path) -> None:
+    assert nnit_zoo("download")[0] == 0
+    options = ("--architecture", "32-16-64-32", "--output", str(tmp_path / "figures"))
+    code, stdout, stderr = nnit_zoo("stats", *options, "--json")
+    assert code == 0, stderr
+    rows = {row["measure"]: row for row in json.loads(stdout)}
+    zoo = Zoo.open(files.default_folder("PickCube-v1"))
+    batch = zoo.batch("32-16-64-32", "seen")
+    expected = (batch.flat()[0].double() - batch.flat()[1].double()).norm()
+    assert rows["nearest L2"]["32-16-64-32"] == pytest.approx(float(expected))
+    assert rows["nearest L2"]["paper"] == 46.94
+    for name in ("magnitudes.png", "pairs.png"):
+        assert str(tmp_path / "figures" / name) in stderr
+        pixels = imread(tmp_path / "figures" / name)
+        assert pixels.std() > 0.1
+    assert "46.940" in nnit_zoo("stats", "--architecture", "32-16-64-32")[1]
+    assert_error(nnit_zoo("stats", "--architecture", "64-64-64-32"), "at least two policies")
+    assert_error(nnit_zoo("stats", "--architecture", "64-64-64-33"), "64-64-64-3")
+
+
+def test_export_and_card(nnit_zoo: Command, tmp_path: Path) -> None:
+    assert nnit_zoo("download")[0] == 0
+    output = tmp_path / "policy.safetensors"
+    assert nnit_zoo("export", "PickCube-v1/32-16-64-32/001", str(output))[:2] == (0, f"{output}\n")
+    assert output.is_file()
+    assert nnit_zoo("export", "PickCube-v1", str(tmp_path / "set"))[0] == 0
+    assert (tmp_path / "set" / "README.md").read_text() == nnit_zoo("card")[1]
+    assert nnit_zoo("download", "--folder", str(tmp_path / "again"), "--source", str(tmp_path / "set"))[0] == 0
+    assert json.loads(nnit_zoo("card", "--json")[1]) == json.loads(nnit_zoo("list", "--json")[1])
+
+
+def test_a_full_disk_is_said_without_a_traceback(
+    nnit_zoo: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    assert nnit_zoo("download")[0] == 0
+    monkeypatch.setattr(export, "write_bytes", full)
+    output = str(tmp_path / "policy.safetensors")
+    result = nnit_zoo("export", "PickCube-v1/32-16-64-32/001", output)
+    assert_error(result, f"cannot write {output}: No space left on device")
+
+
+def test_a_task_without_success_has_no_such_columns(
+    nnit_zoo: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_data_folder(tmp_path / "embedded" / "MNIST-PCA32", "MNIST-PCA32", 32, 10)
+    monkeypatch.setattr(files, "EMBEDDED", tmp_path / "embedded")
+    shown = nnit_zoo("show", "MNIST-PCA32")[1]
+    assert "0.960" in shown and "success" not in shown
+    assert "success" not in nnit_zoo("show", "MNIST-PCA32", "--architecture", "32-16-64-32")[1]
+    assert json.loads(nnit_zoo("list", "--json")[1])[0]["splits"]["seen"]["success_at_end"] is None
+    assert "| MNIST-PCA32 | seen | 2 | 3 |  | 0.96 |" in nnit_zoo("card")[1]
+    assert nnit_zoo("download", "--task", "MNIST-PCA32")[0] == 0
+    assert nnit_zoo("verify", "--task", "MNIST-PCA32")[0] == 0
+
+
+def test_completion_knows_the_commands() -> None:
+    script = app.generate_completion(shell="bash")
+    assert "--source" in script and "stats" in script
+
+
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
+        (("download", "--revision", "v1"), ("--source",)),
+        (("download", "--split", "unsen"), ("unseen",)),
         (("download", "--task", "PickCub-v1"), ("PickCub-v1", "did you mean PickCube-v1?")),
         (("show", "--architecture", "32-16-64-33"), ("did you mean", "32-16-64-32")),
         (("download", "--fodler", "x"), ("--fodler", "--folder")),

@@ -6,7 +6,8 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from nnit_zoo import files
-from nnit_zoo import materialise as module
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
@@ -116,10 +117,10 @@ def test_a_damaged_shard_is_found_and_mended(data_folder: Path, zoo_folder: Path
 def test_a_full_disk_names_the_folder_and_the_bytes_needed(
     data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, write: object) -> None:
+    def full(path: Path, content: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(module, "write_atomically", full)
+    monkeypatch.setattr(files, "write_bytes", full)
     size = Manifest.read(data_folder).size
     with pytest.raises(UserError, match=f"no space left in {tmp_path}/zoo: {size} bytes"):
         materialise(data_folder, tmp_path / "zoo")
@@ -138,7 +139,9 @@ def test_ghns_that_do_not_give_the_manifests_shards_are_refused(data_folder: Pat
     tensors = load_file(broken / "ghns.safetensors")
     tensors["lift.bias"][0] += 1
     save_file(tensors, broken / "ghns.safetensors", metadata)
-    with pytest.raises(UserError, match=r"32-16-64-32.safetensors comes out different"):
+    with pytest.raises(
+        UserError, match=r"32-16-64-32.safetensors is not what the manifest promises: it came out different"
+    ):
         materialise(broken, tmp_path / "zoo")
     assert not (tmp_path / "zoo" / "32-16-64-32.safetensors").exists()
     (broken / "ghns.safetensors").write_bytes(b"nothing")
@@ -146,20 +149,42 @@ def test_ghns_that_do_not_give_the_manifests_shards_are_refused(data_folder: Pat
         materialise(broken, tmp_path / "zoo")
 
 
-@pytest.mark.parametrize(("value", "message"), [(1 + 2**-11, "rounding tie"), (1e6, "not finite")])
-def test_policies_that_cannot_be_stored_faithfully_are_refused(
-    data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: float, message: str
-) -> None:
+@contextmanager
+def planted(monkeypatch: pytest.MonkeyPatch, values: Sequence[float]) -> Iterator[None]:
+    """Every GHN emits these parameters at the start of its policies' third layer."""
     emit = GHN.emit
 
-    def emit_with_a_bad_value(ghn: GHN, architecture: Architecture) -> PolicyBatch:
+    def emit_with_values(ghn: GHN, architecture: Architecture) -> PolicyBatch:
         batch = emit(ghn, architecture)
-        batch.layers[2][0, 0, 0] = value
+        batch.layers[2][0, 0, : len(values)] = torch.tensor(values, dtype=batch.layers[2].dtype)
         return batch
 
-    monkeypatch.setattr(GHN, "emit", emit_with_a_bad_value)
-    with pytest.raises(UserError, match=f"PickCube-v1/32-16-64-32/000 .*{message}"):
+    with monkeypatch.context() as patch:
+        patch.setattr(GHN, "emit", emit_with_values)
+        yield
+
+
+def test_policies_that_are_not_finite_are_refused(
+    data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with planted(monkeypatch, (1e6,)), pytest.raises(UserError, match=r"PickCube-v1/32-16-64-32/000 .*not finite"):
         write_manifest(shutil.copytree(data_folder, tmp_path / "bad"))
+
+
+def test_machines_that_round_a_tie_to_different_sides_make_the_same_bytes(
+    data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tie, last_bit = 1 + 2**-11, 2**-52  # halfway between two float16 numbers, and the float64 next to it
+    ours = shutil.copytree(data_folder, tmp_path / "ours")
+    with planted(monkeypatch, (tie + last_bit, -tie, 0.25)):
+        write_manifest(ours)
+        materialise(ours, tmp_path / "here")
+    with planted(monkeypatch, (tie - last_bit, -tie - last_bit, 0.25)):
+        materialise(ours, tmp_path / "there")
+    assert hashes(tmp_path / "here") == hashes(tmp_path / "there")
+    assert Zoo.open(tmp_path / "there").batch("32-16-64-32").layers[2][0, 0, 0] == 1 + 2**-10
+    with planted(monkeypatch, (tie - 1e-6, -tie, 0.25)), pytest.raises(UserError, match="came out different"):
+        materialise(ours, tmp_path / "damaged")  # no rounding of another machine moves a parameter that far
 
 
 def tamper(folder: Path, change: Callable[[list[dict[str, Any]], np.ndarray[Any, Any]], None]) -> None:

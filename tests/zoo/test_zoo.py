@@ -3,11 +3,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 import torch
 
 import nnit_zoo
-from nnit_zoo import files
+from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
@@ -74,6 +75,37 @@ def test_a_training_view_refuses_reference_policies(zoo_folder: Path) -> None:
     seen = plain_batch((32, 16, 64, 32))
     with pytest.raises(UserError, match="held out"):
         TrainingView("PickCube-v1", {seen.architecture: seen}, {seen.architecture: (0, 130)})
+
+
+def test_policies_are_iterated_found_and_filtered(made_once: Path) -> None:
+    zoo = Zoo.open(made_once)
+    policies = list(zoo)
+    assert [policy.record["id"] for policy in policies] == zoo.index["id"].to_pylist()
+    for policy in policies:
+        batch = zoo.batch(policy.record["architecture"])
+        assert torch.equal(policy.weights.flat(), batch[policy.record["row"]].flat())
+    one = zoo["PickCube-v1/32-16-64-32/001"]
+    assert torch.equal(one.weights.flat(), zoo.batch("32-16-64-32")[1].flat())
+    with pytest.raises(UserError, match="did you mean PickCube-v1/32-16-64-32/001"):
+        zoo["PickCube-v1/32-16-64-32/01"]
+
+    ends = zoo.filter((pc.field("ghn_seed") != 1) & (pc.field("architecture") == "32-16-64-32"))
+    assert torch.equal(ends.batch("32-16-64-32").flat(), zoo.batch("32-16-64-32")[[0, 2]].flat())
+    assert ends.ghn_seeds("32-16-64-32") == (0, 128)
+    assert len(ends.filter(pc.field("success_at_end") > 0.8)) == 1
+    for wrong in (pc.field("sucess") > 0.5, pc.field("id") > 0.5):
+        with pytest.raises(UserError, match="cannot filter by"):
+            zoo.filter(wrong)
+
+
+def test_a_module_of_raw_observations_computes_what_the_task_computes(made_once: Path) -> None:
+    policy = Zoo.open(made_once)["PickCube-v1/64-64-64-32/000"]
+    task = tasks.get("PickCube-v1")
+    draws = np.random.default_rng(0).normal(size=(20, 42)).astype(np.float32)
+    raw = task.observation_mean + task.observation_std * draws
+    expected = policy.to_module()(torch.from_numpy(draws))
+    torch.testing.assert_close(policy.to_module(raw=True)(torch.from_numpy(raw)), expected, rtol=1e-3, atol=1e-4)
+    assert [type(layer) for layer in policy.to_module()] == [torch.nn.Linear, torch.nn.Tanh] * 4 + [torch.nn.Linear]
 
 
 def test_a_view_can_be_made_of_plain_batches() -> None:

@@ -1,0 +1,38 @@
+"""What `nnit-zoo` prints on stdout: tables or JSON; rich is imported when it is needed."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def print_json(content: Any) -> None:
+    """Print indented JSON."""
+    sys.stdout.write(json.dumps(content, indent=2) + "\n")
+
+
+def print_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
+    """Print these columns as a table, without those that no row has a value for."""
+    filled = [column for column in columns if any(row[column] is not None for row in rows)]
+    print_table(
+        [column.replace("_", " ") for column in filled],
+        [[_text(row[column]) for column in filled] for row in rows],
+    )
+
+
+def _text(value: Any) -> str:
+    return "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table."""
+    from rich.box import SIMPLE  # noqa: PLC0415
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(*columns, box=SIMPLE)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)

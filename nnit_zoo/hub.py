@@ -1,0 +1,122 @@
+"""Zoos elsewhere: read from a data set of the Hugging Face Hub or from a folder laid out like one, and pushed there.
+
+A source holds `<task>/manifest.json` with the task's index and shards beside it, or these files at its root.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+
+import httpx2
+from huggingface_hub import HfApi, HfFileSystem
+from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalTokenNotFoundError, OfflineModeIsEnabled
+from pydantic import ValidationError
+
+from nnit_zoo import files
+from nnit_zoo.errors import UserError
+from nnit_zoo.files import INDEX, MANIFEST, Entry, Manifest, Progress
+
+_CONNECTIONS = 8
+
+
+class Source:
+    """The zoo of a task at an address: a folder, `owner/name` of a data set of the Hub, or `hf://datasets/owner/name`.
+
+    `revision` is a branch, tag or commit of the data set. Raises UserError if there is no such place or no zoo in it.
+    """
+
+    def __init__(self, address: str, task: str, revision: str | None = None) -> None:
+        self.address = f"{address}@{revision}" if revision else address
+        self._revision = revision
+        self._hub: HfFileSystem | None = None
+        if Path(address).is_dir():
+            root = address
+            if revision:
+                raise UserError(f"{address} is a folder, and only the Hub has revisions: leave out --revision")
+        elif address.startswith(("/", ".", "~")):
+            raise UserError(f"no folder {address}")
+        else:
+            self._hub = HfFileSystem(skip_instance_cache=True)  # what the Hub holds may change
+            root = address.removeprefix("hf://") if address.startswith("hf://") else f"datasets/{address}"
+        self._folder = f"{root}/{task}"
+        with _explained(self.address):
+            try:
+                content = self._read(MANIFEST)
+            except (FileNotFoundError, EntryNotFoundError):
+                self._folder = root
+                content = self._read(MANIFEST)
+        try:
+            self.manifest = Manifest.model_validate_json(content)
+        except ValidationError:
+            raise UserError(f"{MANIFEST} in {address} is damaged, or of another version of nnit") from None
+        if self.manifest.task != task:
+            raise UserError(f"{address} holds the zoo of {self.manifest.task}, not of {task}")
+
+    def _read(self, name: str) -> bytes:
+        """The content of one of the zoo's files."""
+        path = f"{self._folder}/{name}"
+        if self._hub is None:
+            return Path(path).read_bytes()
+        with self._hub.open(path, "rb", revision=self._revision, block_size=0) as file:  # 0: in one request
+            return bytes(file.read())
+
+    def read(self, name: str) -> bytes:
+        """The content of one of the zoo's files; raises UserError if it cannot be read."""
+        with _explained(self.address):
+            return self._read(name)
+
+    @cached_property
+    def index(self) -> bytes:
+        """The content of index.parquet; raises UserError if it is not what the manifest promises."""
+        content = self.read(INDEX)
+        if Entry.of(content) != self.manifest.index:
+            raise UserError(f"{INDEX} is not what the manifest promises: {self._advice}")
+        return content
+
+    def fetch(self, target: Path, progress: Progress | None = None, splits: Collection[str] = files.SPLITS) -> None:
+        """Write the shards of these splits to `target`, as `files.fill` does; what is there already is kept."""
+        files.fill(
+            target, self.manifest, self.index, self._contents, splits=splits, progress=progress, advice=self._advice
+        )
+
+    def _contents(self, names: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        with ThreadPoolExecutor(_CONNECTIONS) as pool:
+            try:
+                yield from zip(names, pool.map(self.read, names), strict=True)
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+    @property
+    def _advice(self) -> str:
+        return f"{self.address} is damaged, or changed meanwhile; run the same command again, or choose a --revision"
+
+
+def push(repository: str, folder: Path) -> str:
+    """Upload a folder as a data set of the Hub, made if it is not there; returns the address of the commit."""
+    with _explained(repository):
+        hub = HfApi()
+        hub.create_repo(repository, repo_type="dataset", exist_ok=True)
+        return str(hub.upload_folder(repo_id=repository, folder_path=folder, repo_type="dataset"))
+
+
+@contextmanager
+def _explained(address: str) -> Iterator[None]:
+    """What the Hub's client raises becomes a UserError that says what to do."""
+    try:
+        yield
+    except OfflineModeIsEnabled:
+        raise UserError(
+            f"{address} cannot be reached, as HF_HUB_OFFLINE is set: unset it, or leave out --source"
+        ) from None
+    except LocalTokenNotFoundError:
+        raise UserError("the Hub wants to know who you are; log in with: hf auth login") from None
+    except (FileNotFoundError, EntryNotFoundError, NotImplementedError, ValueError) as error:
+        raise UserError(f"no such zoo in {address}: {error}") from None
+    except HfHubHTTPError as error:
+        raise UserError(f"the Hub refuses {address}: {error}; log in with: hf auth login") from None
+    except httpx2.HTTPError as error:
+        raise UserError(f"the connection to {address} failed ({error}); run the same command again") from None

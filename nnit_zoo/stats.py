@@ -1,0 +1,154 @@
+"""The paper's analyses of a zoo, each measure beside the paper's number, and its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from torch import Tensor
+
+from nnit_zoo import diversity, tasks
+from nnit_zoo.architecture import Architecture
+from nnit_zoo.atomic import write_atomically
+from nnit_zoo.errors import UserError
+from nnit_zoo.files import Progress
+from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.views.permuted import permuted
+from nnit_zoo.zoo import TrainingView, Zoo
+
+ARCHITECTURES = ("32-16-64-32", "32-64-16-32", "64-64-16-32")  # the paper does not name its three
+ALL = "all seen"
+NEAREST_L2, NEAREST_COSINE = "nearest L2", "nearest cosine"
+# Layer 1 reads the observation, whose entries no permutation of neurons moves: it is left out of these.
+CORRELATION, PERMUTED = "|W| r, layers 2+", "|W| r, permuted"
+PAPER = {  # NNiT's tables of data set diversity and CKA, and its permutation ablation
+    "PickCube-v1": {
+        NEAREST_L2: 46.94,
+        NEAREST_COSINE: 0.17,
+        CORRELATION: 0.65,
+        PERMUTED: 0.0,
+        "CKA, layer 1": 0.917,  # of 35 networks 256-256-256
+        "CKA, layer 2": 0.880,
+        "CKA, layer 3": 0.751,
+        "CKA, mean": 0.849,
+    },
+    "PushCube-v1": {NEAREST_L2: 49.66, NEAREST_COSINE: 0.12},
+    "StackCubeEasy-v1": {NEAREST_L2: 72.79, NEAREST_COSINE: 0.21},
+}
+
+
+def analyse(zoo: Zoo, chosen: Sequence[Architecture], progress: Progress | None = None) -> list[dict[str, Any]]:
+    """Rows of a table: `measure`, its value for each chosen architecture and on average over `all seen`, and `paper`.
+
+    CKA only for the chosen ones, and for tasks with probe states. `progress` is called with the number of newly
+    finished architectures. Raises UserError for a chosen architecture with fewer than two policies.
+    """
+    observations = tasks.get(zoo.task).probe_states()
+    columns: dict[str, dict[str, float]] = {}
+    for architecture in dict.fromkeys([*chosen, *zoo.architectures("seen")]):
+        batch = zoo.batch(architecture, "seen")
+        if len(batch) > 1 or architecture in chosen:
+            columns[str(architecture)] = dict(_alignment(batch, _shuffled(zoo, architecture)))
+        if progress:
+            progress(1)
+    averages = {
+        measure: fmean(column[measure] for column in columns.values()) for measure in next(iter(columns.values()))
+    }
+    for architecture in chosen:
+        if observations is not None:
+            columns[str(architecture)] |= _similarity(zoo.batch(architecture, "seen"), observations)
+        if progress:
+            progress(1)
+    names = [str(architecture) for architecture in chosen]
+    return [
+        {
+            "measure": measure,
+            **{name: columns[name][measure] for name in names},
+            ALL: averages.get(measure),
+            "paper": PAPER.get(zoo.task, {}).get(measure),
+        }
+        for measure in columns[names[0]]
+    ]
+
+
+def _shuffled(zoo: Zoo, architecture: Architecture) -> PolicyBatch:
+    batch, seeds = zoo.batch(architecture, "seen"), zoo.ghn_seeds(architecture, "seen")
+    view = TrainingView(zoo.task, {architecture: batch}, {architecture: seeds})
+    return permuted(view, "policy", seed=0).batches[architecture]
+
+
+def _alignment(batch: PolicyBatch, shuffled: PolicyBatch) -> Iterator[tuple[str, float]]:
+    yield NEAREST_L2, float(diversity.off_diagonal(diversity.distances(batch)).amin(1).mean())
+    yield NEAREST_COSINE, float(diversity.off_diagonal(diversity.cosines(batch)).amax(1).mean())
+    layers = [diversity.mean_correlation(layer) for layer in diversity.magnitudes(batch)]
+    for number, value in enumerate(layers, 1):
+        yield f"|W| r, layer {number}", value
+    yield CORRELATION, fmean(layers[1:])
+    yield PERMUTED, fmean(map(diversity.mean_correlation, diversity.magnitudes(shuffled)[1:]))
+
+
+def _similarity(batch: PolicyBatch, observations: Tensor) -> dict[str, float]:
+    layers = diversity.cka(batch, observations).mean(1)
+    measures = {f"CKA, layer {number}": float(value) for number, value in enumerate(layers, 1)}
+    return measures | {"CKA, mean": float(layers.mean())}
+
+
+def draw(zoo: Zoo, chosen: Sequence[Architecture], folder: Path) -> Iterator[Path]:
+    """Write magnitudes.png (heat maps of |W| over seeds) and pairs.png (histograms over pairs); gives their paths.
+
+    Raises UserError if matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+    except ImportError:
+        raise UserError("figures need matplotlib; run: pip install 'nnit[figures]'") from None
+    batches = [zoo.batch(architecture, "seen") for architecture in chosen]
+    pictures = (
+        ("magnitudes", "mean |W| of each input neuron", _magnitudes),
+        ("pairs", "all pairs of an architecture's policies", _pairs),
+    )
+    for name, title, picture in pictures:
+        figure = Figure(layout="constrained", dpi=150)
+        picture(figure, batches)
+        figure.suptitle(f"{zoo.task}: {title}")
+        path = folder / f"{name}.png"
+        write_atomically(path, partial(figure.savefig, format="png"))
+        yield path
+
+
+def _magnitudes(figure: Any, batches: Sequence[PolicyBatch]) -> None:
+    """A row per architecture, a column per layer: mean |W| of each input neuron (across) for each seed (down)."""
+    depth = max(len(batch.layers) for batch in batches)
+    figure.set_size_inches(2.2 * depth, 1.9 * len(batches))
+    axes = figure.subplots(len(batches), depth, squeeze=False)
+    for row, batch in zip(axes, batches, strict=True):
+        row[0].set_ylabel(f"{batch.architecture}\n{len(batch)} seeds")
+        for number, (axis, profile) in enumerate(zip(row, diversity.magnitudes(batch), strict=False), 1):
+            axis.imshow(profile.numpy(), aspect="auto", cmap="magma", interpolation="nearest")
+            axis.set_yticks([])
+            if batch is batches[0]:
+                axis.set_title(f"layer {number}", fontsize="medium")
+            if batch is batches[-1]:
+                axis.set_xlabel("input neuron")
+
+
+def _pairs(figure: Any, batches: Sequence[PolicyBatch]) -> None:
+    """Histograms of L2 distance and cosine similarity over all pairs of an architecture's policies."""
+    figure.set_size_inches(8, 3)
+    for axis, measure, label in zip(
+        figure.subplots(1, 2),
+        (diversity.distances, diversity.cosines),
+        ("L2 distance", "cosine similarity"),
+        strict=True,
+    ):
+        for batch in batches:
+            values = diversity.pairs(measure(batch))
+            axis.hist(values.numpy(), bins="auto", density=True, histtype="step", label=str(batch.architecture))
+        axis.set_xlabel(label)
+        axis.set_yticks([])
+        axis.spines[["top", "right", "left"]].set_visible(False)
+    figure.axes[0].set_ylabel("share of pairs")
+    figure.axes[1].legend(frameon=False)
