@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -38,14 +37,16 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.materialise import stored, write_manifest
 from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.policy import concatenate
+from nnit_zoo.provenance import commit
 from nnit_zoo.sim.tabletop import require_simulator
 from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.robot import RobotPolicyTask
-from nnit_zoo.tasks.task import Task, data_folder
+from nnit_zoo.tasks.task import PROBE, Task, data_folder
 from nnit_zoo.zoo import HELDOUT_SEEDS_FROM
 
 Stage = Literal["all", "expert", "states", "features", "ghns", "scores", "pack"]
 POLICIES_PER_ARCHITECTURE = 100
+PROBE_STATES = 2000
 STD_FLOOR = 0.05  # keeps near-constant observations from being blown up; decides the weight error policies survive
 SELECTION_SCHEMA = pa.schema(
     [
@@ -131,7 +132,7 @@ class Builder(ABC):
         # One entry, because safetensors writes several in an order that changes from run to run.
         note = {"nnit": json.dumps({"task": self.task.name, **sizes, "ghn_seeds": list(self.seeds)})}
         write_atomically(self.data / "ghns.safetensors", lambda temporary: save_file(stacked, temporary, note))
-        self._record(ghns={**record, "commit": _commit()})
+        self._record(ghns={**record, "commit": str(commit())})
 
     def scores(self) -> None:
         """Score every candidate, on exactly its stored float16 weights; a file per architecture."""
@@ -189,7 +190,7 @@ class Builder(ABC):
         seen = [row for row in rows if row["split"] == "seen" and row["ghn_seed"] < HELDOUT_SEEDS_FROM]
         passed = sum(row["kept"] for row in seen)
         episodes = self.task.scoring_seeds
-        self._record(scores={"episodes": len(episodes), "seeds_from": episodes.start, "commit": _commit()})
+        self._record(scores={"episodes": len(episodes), "seeds_from": episodes.start, "commit": str(commit())})
         log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass")
 
     def _ghn(self, seed: int) -> Path:
@@ -236,9 +237,11 @@ class RobotBuilder(Builder):
                 "version": self.task.version,
                 "observation_mean": states.mean(0).astype(np.float32).tolist(),
                 "observation_std": np.maximum(states.std(0), STD_FLOOR).astype(np.float32).tolist(),
-                "build": {"expert": {**record, "config": self.expert_config.model_dump(), "commit": _commit()}},
+                "build": {"expert": {**record, "config": self.expert_config.model_dump(), "commit": str(commit())}},
             },
         )
+        probe = torch.from_numpy(states[np.arange(PROBE_STATES) * len(states) // PROBE_STATES]).half()
+        write_atomically(self.data / PROBE, lambda temporary: save_file({"states": probe}, temporary))
         experts.save(network, self.data / "expert.safetensors")
         log(f"expert: {json.dumps(record)}")
 
@@ -289,7 +292,7 @@ class MNISTBuilder(Builder):
         earlier = json.loads(target.read_text())["build"] if target.exists() else {}
         constants, facts = mnist.build_features(self.source, self.data / FEATURES)
         content = {"name": self.task.name, "version": self.task.version, **constants}
-        write_json(target, {**content, "build": {**earlier, "features": {**facts, "commit": _commit()}}})
+        write_json(target, {**content, "build": {**earlier, "features": {**facts, "commit": str(commit())}}})
         log(f"features: {json.dumps(facts)}")
 
     def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
@@ -326,15 +329,3 @@ def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Itera
             "episodes": row["seed_count"],
             "kept": row["ghn_seed"] in kept,
         }
-
-
-def _commit() -> str:
-    """The commit of the code that builds, with `+` if files differ from it."""
-    try:
-        run = subprocess.run(
-            ["git", "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],  # noqa: S607
-            cwd=Path(__file__).parent, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return run.stdout.strip()

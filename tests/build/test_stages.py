@@ -83,6 +83,7 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
         "ghns.safetensors",
         "index.parquet",
         "manifest.json",
+        "probe.safetensors",
         "scores.parquet",
         "selection.parquet",
     }
