@@ -6,13 +6,14 @@ READY := $(BIN)/.ready
 # One thread per process: the work is spread over processes, and idle OpenMP threads spin.
 export OMP_NUM_THREADS := 1
 
-.PHONY: help bench test test-slow lint
+.PHONY: help bench test test-slow lint render-setup
 
 help:
-	@echo 'make bench      score NNiT on PickCube-v1, unseen architectures, and print the table'
-	@echo 'make test       lint, types and tests'
-	@echo 'make test-slow  the tests that take minutes'
-	@echo 'make lint       ruff and mypy only'
+	@echo 'make bench         score NNiT on PickCube-v1, unseen architectures, and print the table'
+	@echo 'make test          lint, types and tests'
+	@echo 'make test-slow     the tests that take minutes'
+	@echo 'make lint          ruff and mypy only'
+	@echo 'make render-setup  fetch what nnit-bench render needs on a machine without a GPU (Debian)'
 
 bench: $(READY)
 	@$(BIN)/nnit-bench run --method nnit
@@ -27,6 +28,9 @@ lint: $(READY)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+
+render-setup:
+	@sh nnit_zoo/sim/lavapipe.sh
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -23,7 +23,7 @@ from nnit_zoo.build import expert
 from nnit_zoo.sim import headless, tabletop
 from nnit_zoo.sim.rollout import rollout
 from nnit_zoo.sim.tabletop import Array
-from nnit_zoo.tasks.robot import RobotPolicyTask
+from nnit_zoo.tasks.robot import SCENES, RobotPolicyTask
 from nnit_zoo.tasks.task import data_folder
 
 Act = Callable[[Array], Array]
@@ -120,7 +120,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     robots = [name for name in tasks.names() if isinstance(tasks.get(name), RobotPolicyTask)]
     parser.add_argument("--task", choices=robots, action="append")
-    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--episodes", type=int, default=100)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
@@ -145,7 +145,7 @@ def measure(task: RobotPolicyTask, episodes: int) -> None:
     )
     turns = [
         (in_place(seeds, act), rebuilt(seeds, act), *ours(task, seeds, act), resets(task, seeds))
-        for seeds in units(range(episodes), 25)
+        for seeds in units(range(episodes), SCENES["fast"])
     ]
     seconds = dict(zip(names, np.sum(turns, axis=0), strict=True))
     reset = seconds.pop("reset")
@@ -153,8 +153,8 @@ def measure(task: RobotPolicyTask, episodes: int) -> None:
     sys.stdout.write(f"{task.name}, {episodes} episodes, steps a second of processor time\n")
     for label, time_taken in seconds.items():
         rate = episodes * task.episode_steps / time_taken
-        factor = seconds["stock, reset in place"] / time_taken
-        sys.stdout.write(f"  {label:36}{rate:8.0f}  {factor:5.1f} x stock\n")
+        factor = seconds["stock, rebuilt for each episode"] / time_taken
+        sys.stdout.write(f"  {label:36}{rate:8.0f}  {factor:5.1f} x stock rebuilt\n")
     sys.stdout.write(f"  of bare PhysX's speed, nnit has         {seconds['bare px.step()'] / total:6.1%}\n")
     sys.stdout.write(f"  of an episode, the fresh scene takes    {reset / total:6.1%}\n")
     sys.stdout.write(f"  two processes finish as many units in   {two_workers(task.name):6.1%} of one's time\n")

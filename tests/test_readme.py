@@ -1,4 +1,4 @@
-"""What the README tells a newcomer to type: every shell command parses, and the plug-in example works as it stands."""
+"""What README and docs tell a newcomer to type: every shell command parses, and the README's example works."""
 
 import re
 import shlex
@@ -16,14 +16,15 @@ from nnit_zoo.architecture import Architecture
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+PAGES = [README, *(path.read_text() for path in sorted((ROOT / "docs").glob("*.md")))]
 APPS = {"nnit-zoo": nnit_zoo.cli.app, "nnit-bench": nnit_bench.cli.app}
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.DOTALL | re.MULTILINE)
+def blocks(language: str, page: str = README) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
 
 
-COMMANDS = [line for block in blocks("sh") for line in block.splitlines() if line]
+COMMANDS = [line for page in PAGES for block in blocks("sh", page) for line in block.splitlines() if line]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

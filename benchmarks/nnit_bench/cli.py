@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import sys
-import time
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from nnit_zoo.architecture import Split
 from nnit_zoo.cli import run as run_application
+from nnit_zoo.console import print_json
 from nnit_zoo.errors import UserError
 
 if TYPE_CHECKING:
-    from nnit_bench.display import Display
     from nnit_bench.protocol import Protocol
-    from nnit_bench.runner import Outcome, ZooRow
-    from nnit_zoo.tasks.task import Task
+    from nnit_bench.tables import Results
+    from nnit_zoo.display import Display
+    from nnit_zoo.tasks.task import Simulator, Task
     from nnit_zoo.zoo import Zoo
 
 app = App(
@@ -31,6 +29,11 @@ app = App(
 )
 
 
+app.command("nnit_bench.compare:compare", name="compare", help="Say whether two methods can be told apart.")
+app.command("nnit_bench.check:check", name="check", help="Say whether a method keeps to the contract of a generator.")
+app.command("nnit_bench.report:report", name="report", help="Write all stored results as tables and figures.")
+app.command("nnit_bench.paper:reproduce", name="reproduce", help="Print a table of the paper with our rows in it.")
+
 Json = Annotated[bool, Parameter(name="--json")]
 Names = Annotated[tuple[str, ...], Parameter(show_default=lambda names: ", ".join(names) or "all")]
 
@@ -38,22 +41,27 @@ Names = Annotated[tuple[str, ...], Parameter(show_default=lambda names: ", ".joi
 @Parameter(name="*")
 @dataclass(frozen=True)
 class What:
-    """What is scored; the defaults are the benchmark's."""
+    """What is scored; the defaults are the benchmark's. For several names, repeat an option or use commas."""
 
     method: Names = ("nnit",)
-    """Name, package.module:Class or path/to/file.py:Class of a generator; for several, repeat it or use commas."""
-    task: str = "PickCube-v1"
+    """Name, package.module:Class or path/to/file.py:Class of a generator."""
+    task: Names = ("PickCube-v1",)
     """The task to score on."""
-    split: Split = "unseen"
-    """The architectures to generate policies for."""
+    split: Names = ("unseen",)
+    """The architectures to generate policies for: unseen, seen, excluded; joint, where the generator chooses them; or
+    beyond the zoo's, offgrid, wide, deep, shallow."""
     policies: int | None = None
-    """Policies per architecture; by default 10, and on the seen split 100 spread over all."""
-    episodes: int = 50
-    """Episodes per policy."""
+    """Policies per architecture, or in all on joint; by default 10, and 100 in all on the seen split and on joint."""
+    episodes: int | None = None
+    """Episodes per policy; by default the task's number, 50 for a robot task."""
     seed: int = 0
     """Seed of the generator's sampling."""
     architecture: Names = ()
-    """Only this architecture of the split, such as 32-32-16-64; may be repeated."""
+    """Only this architecture of the split, such as 32-32-16-64."""
+    protocol: Literal["paper", "heldout"] = "heldout"
+    """How the ten best are scored: on the episodes that selected them, as in the paper, or on others as well."""
+    sim: Literal["fast", "stock", "stock-gpu"] = "fast"
+    """What plays a robot task's episodes: ours, or plain ManiSkill on a CPU or a GPU (the last is untested)."""
     steps: int | None = None
     """Sampling steps, for a method that takes them."""
     checkpoint: str | None = None
@@ -67,49 +75,97 @@ class How:
 
     workers: int = 2
     """Processes that simulate."""
+    parallel: Literal["processes", "ray"] = "processes"
+    """Where they run: on this machine, or on a Ray cluster."""
     output: Path = Path("results")
     """Folder of the result files."""
-    overwrite: bool = False
-    """Repeat a run even if an identical one has finished."""
+    overwrite: Literal["never", "missing", "always"] = "missing"
+    """Whether to do what has been done: missing finishes what is unfinished, never leaves it, always repeats all."""
     as_json: Json = False
-    """Print JSON instead of the table."""
+    """Print JSON instead of tables."""
     quiet: bool = False
     """Print no progress and no notes."""
 
 
-DEFAULT_WHAT, DEFAULT_HOW = What(), How()
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Shot:
+    """Whose episode is filmed; the defaults are the first policies and the first episode that `run` scores."""
+
+    method: str = "nnit"
+    """Name, package.module:Class or path/to/file.py:Class of a generator."""
+    task: str = "PickCube-v1"
+    """A robot task."""
+    split: str = "unseen"
+    """The architectures to generate policies for, as of `run`."""
+    architecture: Names = ()
+    """Only this architecture of the split, such as 32-32-16-64."""
+    policies: int = 1
+    """Policies per architecture, or in all on joint."""
+    episode_seed: int | None = None
+    """Seed of the episode, as in a run's episodes.parquet."""
+    seed: int = 0
+    """Seed of the generator's sampling."""
+    checkpoint: str | None = None
+    """Checkpoint folder, or id on the Hugging Face Hub; by default the checkpoint that ships with nnit."""
+    output: Path = Path("renders")
+    """Folder of the pictures."""
+    quiet: bool = False
+    """Print no progress."""
+
+
+DEFAULT_WHAT, DEFAULT_HOW, DEFAULT_SHOT = What(), How(), Shot()
 
 
 @app.command
 def run(*, what: What = DEFAULT_WHAT, how: How = DEFAULT_HOW) -> None:
     """Generate policies with a method, score them, and print the table.
 
-    A finished run is kept under results/ and found again: the same command prints it at once.
+    A finished run is kept under results/ and found again: the same command prints it at once. An interrupted one goes
+    on where it stopped. Exit code 1 means that a run failed, 2 that the command makes no sense.
     """
     from nnit_baselines import generator
-    from nnit_bench import display, runner
-    from nnit_zoo import tasks
+    from nnit_bench import runner, tables
+    from nnit_zoo import display
 
-    task = tasks.get(what.task)
-    task.check_installed()
-    methods = [name for text in what.method for name in text.split(",") if name]
+    methods, tasks, splits = (_names(each) for each in (what.method, what.task, what.split))
     for name in methods:
         generator.get(name)  # a wrong name is told now, not after the work for the names before it
-    if not methods or (what.checkpoint and len(methods) > 1):
-        raise UserError("--checkpoint belongs to one --method" if methods else "--method needs a name")
+    if not (methods and tasks and splits):
+        raise UserError("--method, --task and --split each need a name")
+    if what.checkpoint and len(methods) * len(tasks) > 1:
+        raise UserError("--checkpoint belongs to one --method and one --task")
     if how.workers < 1:
         raise UserError(f"--workers must be 1 or more, not {how.workers}")
-    protocol = _protocol(task, what)
     screen = display.Display(how.quiet)
-    zoo = _zoo(task.name, screen)
-    outcomes = [_run_one(name, zoo, protocol, what, how, screen) for name in methods]
-    zoo_row = runner.zoo_row(zoo.index, protocol)
+    chosen = [_task(name, what.sim) for name in tasks]
+    protocols = {task: [_protocol(task, split, what) for split in splits] for task in chosen}
+    execution = runner.Execution(
+        output=how.output,
+        stage=screen.stage,
+        workers=how.workers,
+        parallel=how.parallel,
+        overwrite=how.overwrite,
+    )
+    zoos = {task: _zoo(task.name, screen) for task in chosen}
+    results, errors = [], []
+    for task, zoo in zoos.items():
+        for protocol in protocols[task]:
+            outcomes = []
+            for name in methods:
+                try:
+                    entrant = runner.enter(name, zoo, protocol, checkpoint=what.checkpoint, steps=what.steps)
+                    outcomes.append(runner.run(task, zoo, entrant, protocol, execution))
+                except UserError as error:  # the others' work should not be lost to it
+                    errors.append(f"{name} on {protocol.task}, {protocol.split}: {error}")
+            results.append(tables.Results(protocol, outcomes, runner.zoo_row(zoo.index, protocol)))
     if how.as_json:
-        _print_json(protocol, outcomes, zoo_row)
-        return
-    display.print_table(protocol, outcomes, zoo_row)
-    for outcome in outcomes:
-        screen.note(f"{outcome.record.method.name}: {outcome.folder}")
+        print_json({"tables": [tables.plain(each) for each in results], "errors": errors})
+    else:
+        _print(results, screen)
+    if errors:
+        sys.stderr.write("".join(f"error: {text}\n" for text in errors))
+        sys.exit(1)
 
 
 @app.command
@@ -117,34 +173,71 @@ def train(
     *,
     method: str = "nnit",
     task: str = "PickCube-v1",
+    preset: str | None = None,
     steps: int | None = None,
     seed: int = 0,
     output: Path | None = None,
+    quiet: bool = False,
 ) -> None:
     """Train a method on a task's zoo and write its checkpoint; after an interruption, the same command goes on.
 
     Args:
         method: Name, package.module:Class or path/to/file.py:Class of a generator.
         task: Name of the task.
+        preset: The method's settings of this name, such as nnit's paper, instead of its default ones.
         steps: Optimiser steps, instead of the method's own number.
         seed: Seed of the training.
         output: Folder of the checkpoint; by default runs/METHOD/TASK.
+        quiet: Print no progress and no notes.
     """
     from nnit_baselines import generator, training
-    from nnit_bench.display import Display
     from nnit_bench.records import folder_name
     from nnit_zoo import tasks
+    from nnit_zoo.display import Display
 
     task = tasks.get(task).name
     generator.get(method)
     folder = output or Path("runs") / folder_name(method) / task
-    screen = Display(quiet=False)
+    screen = Display(quiet)
     zoo = _zoo(task, screen)
     with screen.steps(f"training {method}") as progress:
         settings = generator.Run(steps=steps, seed=seed, folder=folder / "state", progress=progress)
-        training.train(method, task, settings, folder, zoo.folder)
+        training.train(method, task, settings, folder, zoo.folder, preset)
     sys.stdout.write(f"{folder}\n")
     screen.note(f"score it with: nnit-bench run --method {method} --task {task} --checkpoint {folder}")
+
+
+@app.command
+def render(*, shot: Shot = DEFAULT_SHOT) -> None:
+    """Film generated policies at work: an MP4 of all side by side, and a PNG with a snapshot every ten steps.
+
+    The episodes are those that `run` scores, replayed in ManiSkill. A machine without a GPU needs `make render-setup`.
+    """
+    task = _task(shot.task, "fast")  # before what the simulator's extra brings is imported
+
+    from nnit_bench import film, runner
+    from nnit_bench.protocol import Protocol
+    from nnit_bench.records import folder_name
+    from nnit_zoo.display import Display
+    from nnit_zoo.sim.render import camera
+
+    screen = Display(shot.quiet)
+    task = film.robot_task(task)
+    protocol = Protocol.of(task, shot.split, only=_names(shot.architecture), seed=shot.seed)
+    seed = protocol.select.first if shot.episode_seed is None else shot.episode_seed
+    with camera(task.name) as take:  # what cannot render is told before any other work
+        zoo = _zoo(task.name, screen)
+        entrant = runner.enter(shot.method, zoo, protocol, checkpoint=shot.checkpoint)
+        policies = film.choose(task, entrant, protocol, shot.policies, screen.stage)
+        scenes = []
+        with screen.stage(f"{task.name}: filming", len(policies)) as advance:
+            for title, policy in policies:
+                scenes.append(film.shoot(task, policy, seed, title, take))
+                advance(1)
+    for suffix, make in ((".png", film.strip), (".mp4", film.video)):
+        path = shot.output / f"{task.name}-{folder_name(shot.method)}{suffix}"
+        film.write(path, make(scenes))
+        sys.stdout.write(f"{path}\n")
 
 
 @app.command(name="list")
@@ -153,13 +246,14 @@ def list_names(*, as_json: Json = False) -> None:
     from nnit_baselines import generator
     from nnit_zoo import tasks
 
-    methods = {name: [task for task in tasks.names() if generator.checkpoint(name, task)] for name in generator.names()}
+    found = generator.available()
+    methods = {name: [task for task in tasks.names() if generator.checkpoint(name, task)] for name in found}
     if as_json:
-        _write_json({"methods": methods, "tasks": tasks.names()})
+        print_json({"methods": methods, "tasks": tasks.names()})
         return
     for name, shipped in methods.items():
         checkpoints = f"checkpoint for {', '.join(shipped)}" if shipped else "no checkpoint"
-        needed = generator.get(name).capabilities.checkpoint
+        needed = found[name].capabilities.checkpoint
         sys.stdout.write(f"method  {name:12}  {checkpoints if needed else 'needs no training'}\n")
     for name in tasks.names():
         sys.stdout.write(f"task    {name}\n")
@@ -170,17 +264,33 @@ def main() -> None:
     run_application(app)
 
 
-def _protocol(task: Task, what: What) -> Protocol:
-    from nnit_bench.protocol import Protocol, policies_per_architecture
+def _names(texts: tuple[str, ...]) -> list[str]:
+    """The names in an option that may be repeated and may hold commas."""
+    return [name for text in texts for name in text.split(",") if name]
 
-    return Protocol(
-        task=task.name,
-        task_version=task.version,
-        split=what.split,
-        policies=policies_per_architecture(what.split, what.policies, what.architecture),
+
+def _protocol(task: Task, split: str, what: What) -> Protocol:
+    from nnit_bench.protocol import Protocol
+
+    return Protocol.of(
+        task,
+        split,
+        selection=what.protocol,
+        policies=what.policies,
+        only=_names(what.architecture),
         episodes=what.episodes,
         seed=what.seed,
     )
+
+
+def _task(name: str, simulator: Simulator) -> Task:
+    from nnit_zoo import tasks
+
+    task = tasks.get(name)
+    if simulator != "fast":
+        task = task.simulated_by(simulator)
+    task.check_installed()
+    return task
 
 
 def _zoo(task: str, screen: Display) -> Zoo:
@@ -198,47 +308,14 @@ def _zoo(task: str, screen: Display) -> Zoo:
     return nnit_zoo.load(task)
 
 
-def _run_one(name: str, zoo: Zoo, protocol: Protocol, what: What, how: How, screen: Display) -> Outcome:
-    from nnit_baselines import generator
-    from nnit_bench import records, runner
-    from nnit_zoo import tasks
-    from nnit_zoo.files import MANIFEST, sha256_of
+def _print(results: list[Results], screen: Display) -> None:
+    from nnit_bench import tables
 
-    start = time.perf_counter()
-    prepared = generator.prepare(name, zoo, protocol.split, what.checkpoint)
-    if what.steps is not None:
-        runner.set_steps(name, prepared, what.steps)
-    entrant = runner.contestant(name, prepared, time.perf_counter() - start)
-    code = records.this_code(type(prepared))
-    identity = records.Identity(
-        protocol=protocol,
-        method=entrant.method,
-        zoo_sha256=sha256_of(zoo.folder / MANIFEST),
-        code_sha256=code.sha256,
-        packages=records.numeric_packages(),
-    )
-    earlier = None if how.overwrite else runner.finished(identity, how.output)
-    if earlier:
-        screen.note(f"{name}: this run has finished before; --overwrite repeats it")
-        return earlier
-    task = tasks.get(protocol.task)
-    return runner.run(task, entrant, identity, code, how.output, workers=how.workers, stage=screen.stage)
-
-
-def _print_json(protocol: Protocol, outcomes: list[Outcome], zoo_row: ZooRow | None) -> None:
-    from nnit_bench.records import plain
-
-    _write_json(
-        {
-            "protocol": protocol.model_dump(mode="json"),
-            "runs": [
-                {"folder": str(outcome.folder), "reused": outcome.reused, **outcome.record.model_dump(mode="json")}
-                for outcome in outcomes
-            ],
-            "zoo": zoo_row and {"episodes": zoo_row.episodes, "results": plain(zoo_row.summary)},
-        }
-    )
-
-
-def _write_json(content: Any) -> None:
-    sys.stdout.write(json.dumps(content, indent=2) + "\n")
+    for number, each in enumerate(results):
+        if number:
+            sys.stdout.write("\n")
+        tables.show(each)
+    for each in results:
+        for outcome in each.outcomes:
+            done = ", which had finished before; --overwrite always repeats it" if outcome.reused else ""
+            screen.note(f"{outcome.record.method.name}: {outcome.folder}{done}")

@@ -1,24 +1,26 @@
-"""What a run leaves behind: `run.json`, which says what was done, and `episodes.parquet`, with a row per episode.
+"""What a run leaves behind, in a folder of its own; imports no torch, so that results are read anywhere.
 
     results/<task>/<split>/<method>/<run id>/
+        run.json          what was done and what came out
+        episodes.parquet  a row per episode, from which every score follows
+        policies.parquet  a row per generated policy: its hash, and how far it is from the zoo's
 
 The run id is a hash of everything that determines the episodes, so the same command finds its finished run again. The
-record is written as `started` before any work; a run that was cut off stays so until it is repeated.
+record is written as `started` before any work; a run that was cut off stays so until it is taken up again.
 """
 
 from __future__ import annotations
 
 import errno
 import hashlib
-import inspect
 import json
 import os
 import platform
 import re
-import subprocess
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, distributions, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,28 +30,32 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from nnit_baselines.generator import Generator
 from nnit_bench.protocol import Protocol
-from nnit_bench.statistics import Summary
-from nnit_zoo.build.files import write_atomically
+from nnit_bench.views import Summary
+from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import sha256_of
+from nnit_zoo.provenance import commit
 
 EPISODES = "episodes.parquet"
+POLICIES = "policies.parquet"
 RECORD = "run.json"
 EPISODE_SCHEMA = pa.schema(
     [
         ("method", pa.string()),
+        ("training_seed", pa.int64()),  # null for a method that is not trained
+        ("sampling_seed", pa.int64()),
         ("task", pa.string()),
+        ("task_version", pa.int32()),
         ("split", pa.string()),
         ("architecture", pa.string()),
         ("policy", pa.int32()),
         ("phase", pa.string()),
-        ("seed", pa.int64()),
+        ("episode_seed", pa.int64()),
         ("return", pa.float32()),
-        ("success_once", pa.bool_()),
+        ("success_once", pa.bool_()),  # null, like the next, where a task has no notion of success
         ("success_at_end", pa.bool_()),
-        ("reason", pa.string()),
+        ("reason", pa.string()),  # why a policy scored 0 without an episode
     ]
 )
 OUR_PACKAGES = ("nnit_zoo", "nnit_baselines", "nnit_bench")
@@ -65,12 +71,38 @@ class Method(BaseModel):
     name: str
     config: dict[str, Any]
     """The generator's own settings, as config.json holds them; empty for one that has no checkpoint."""
+    given: dict[str, Any]
+    """What the command set, on top of the method's defaults: `checkpoint`, `steps`."""
+    training: dict[str, Any]
+    """Facts about its training, such as seed, seconds and machine; empty for a method that is not trained."""
+    parameters: int | None
+    """Numbers in its checkpoint."""
     checkpoint_sha256: str | None
     """Of the checkpoint's model.safetensors; null for a generator that is fitted at every run."""
+
+    @property
+    def label(self) -> str:
+        """The name as tables show it: of a plug-in, its file without the folders."""
+        return self.name.rpartition("/")[2]
+
+
+class ZooVersion(BaseModel):
+    """The zoo that the generator learned from and is measured against."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sha256: str
+    """Of its manifest.json, which holds the hash of every shard."""
+    policies: int
+    """Policies of seen architectures and training seeds: what a generator may learn from."""
+    seeds: int
+    """Hypernetworks that these come from."""
 
 
 class Code(BaseModel):
     """The code that ran."""
+
+    model_config = ConfigDict(extra="forbid")
 
     sha256: str
     """Of the source files of nnit_zoo, nnit_baselines and nnit_bench, and of a method given as a file."""
@@ -82,6 +114,8 @@ class Code(BaseModel):
 class Hardware(BaseModel):
     """The machine that ran it."""
 
+    model_config = ConfigDict(extra="forbid")
+
     machine: str
     processor: str
     cores: int
@@ -91,9 +125,47 @@ class Hardware(BaseModel):
 class Timings(BaseModel):
     """Wall-clock seconds of a run's parts."""
 
+    model_config = ConfigDict(extra="forbid")
+
     load_or_fit: float
     sample: float
+    novelty: float
     score: float
+
+
+class Distance(BaseModel):
+    """How far generated policies are from known ones, and how far policies of held-out seeds are."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    median: float
+    """Over the generated policies: distance to the nearest known one."""
+    heldout: float | None
+    """Over policies of held-out seeds of the same architectures, the yardstick; null if the zoo has none."""
+    ratio: float | None
+    """`median` / `heldout`: near 0 for copies, near 1 for policies as new as those of another seed."""
+
+
+class Novelty(BaseModel):
+    """Whether the generated policies are new; the distances of each are in policies.parquet."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    same_architecture: Distance | None
+    """Relative L2 to the nearest policy of the same architecture by a corpus seed: a training policy on `seen`,
+    elsewhere what a known seed would have been there. Null if the zoo has no policies of these architectures."""
+    any_architecture: Distance | None
+    """Relative L2, over the blocks that both have, to the nearest training policy of any architecture, with weights in
+    units of the root of their fan-in. Null if the zoo has no policies of that depth."""
+    actions: Distance | None
+    """Root mean square difference of what the policies do on the task's probe states, to the nearest policy of the same
+    architecture by a corpus seed. Null if there are none, or the task has no probe states."""
+    copies: int
+    """Generated policies within 0.1 % (relative L2) of a known one of the same architecture or a training policy."""
+    pairwise_l2: float | None
+    """Mean L2 distance between generated policies of one architecture; null if no architecture has two."""
+    pairwise_cosine: float | None
+    """Mean cosine similarity between generated policies of one architecture."""
 
 
 class Identity(BaseModel):
@@ -107,13 +179,13 @@ class Identity(BaseModel):
 
     @property
     def run_id(self) -> str:
-        """The first 12 hexadecimal digits of the hash of all fields."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        """The first 12 hexadecimal digits of the hash of all fields, but for how the method came to be what it is."""
+        text = json.dumps(self.model_dump(mode="json", exclude={"method": {"training", "given"}}), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def folder(self, output: Path) -> Path:
         """Where the run belongs under the results folder."""
-        return _folder(output, self.protocol, self.method.name, self.run_id)
+        return output / self.protocol.task / self.protocol.split / folder_name(self.method.name) / self.run_id
 
 
 class RunRecord(BaseModel):
@@ -123,31 +195,33 @@ class RunRecord(BaseModel):
 
     schema_version: Literal[1] = 1
     run_id: str
-    status: Literal["started", "success", "failed"] = "started"
+    status: Literal["started", "success", "failed", "unsupported"] = "started"
+    """`unsupported`: the method cannot make what the split asks for; that is no failure, and no row of zeros."""
     error: str | None = None
-    """In words, if the status is `failed`."""
+    """In words, why there are no results."""
     started: datetime
     finished: datetime | None = None
     protocol: Protocol
     method: Method
-    zoo_sha256: str
-    """Of the zoo's manifest.json, which holds the hash of every shard."""
+    zoo: ZooVersion
     code: Code
     packages: dict[str, str]
+    """Name and version of everything installed."""
     hardware: Hardware
     timings: Timings | None = None
-    results: dict[str, Any] | None = None
-    """The table row, computed from the episodes: estimates[metric][statistic] = {value, low, high}."""
+    results: Summary | None = None
+    """Computed from the episodes."""
+    novelty: Novelty | None = None
 
     @classmethod
-    def start(cls, identity: Identity, code: Code) -> RunRecord:
+    def start(cls, identity: Identity, zoo: ZooVersion, code: Code) -> RunRecord:
         """The record of a run that begins now, on this machine."""
         return cls(
             run_id=identity.run_id,
             started=datetime.now(UTC),
             protocol=identity.protocol,
             method=identity.method,
-            zoo_sha256=identity.zoo_sha256,
+            zoo=zoo,
             code=code,
             packages=installed_packages(),
             hardware=this_machine(),
@@ -158,43 +232,45 @@ class RunRecord(BaseModel):
         """The record in a run folder; raises UserError if it is missing or damaged."""
         try:
             return cls.model_validate_json((folder / RECORD).read_text())
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             raise UserError(f"no {RECORD} in {folder}") from None
         except (ValidationError, UnicodeDecodeError) as error:
-            raise UserError(f"{folder / RECORD} is damaged, or from another version of nnit: {error}") from None
+            problem = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+            raise UserError(f"{folder / RECORD} is damaged, or from another version of nnit: {problem}") from None
 
-    def folder(self, output: Path) -> Path:
-        """Where the run belongs under the results folder."""
-        return _folder(output, self.protocol, self.method.name, self.run_id)
-
-    def write(self, output: Path) -> None:
+    def write(self, folder: Path) -> None:
         """Write run.json; the file is either the old one or the new one at any moment."""
         content = self.model_dump_json(indent=2) + "\n"
-        _write(self.folder(output) / RECORD, lambda path: path.write_text(content))
+        _write(folder / RECORD, lambda path: path.write_text(content))
 
-    def finish(self, output: Path, episodes: pa.Table, timings: Timings, summary: Summary) -> RunRecord:
-        """Write the episodes, then the record with status `success`; returns that record."""
-        table = episodes.cast(EPISODE_SCHEMA)
-        _write(self.folder(output) / EPISODES, lambda path: pq.write_table(table, path, compression="zstd"))
-        changes = {
-            "status": "success",
-            "finished": datetime.now(UTC),
-            "timings": timings,
-            "results": plain(summary),
-        }
-        record = self.model_copy(update=changes)
-        record.write(output)
+    def finish(
+        self,
+        folder: Path,
+        episodes: pa.Table,
+        policies: pa.Table,
+        *,
+        timings: Timings,
+        results: Summary,
+        novelty: Novelty,
+    ) -> RunRecord:
+        """Write the tables, then the record with status `success`; returns that record."""
+        for name, table in ((EPISODES, episodes.cast(EPISODE_SCHEMA)), (POLICIES, policies)):
+            _write(folder / name, lambda path, table=table: pq.write_table(table, path, compression="zstd"))  # type: ignore[misc]
+        return self._close(folder, status="success", timings=timings, results=results, novelty=novelty)
+
+    def stop(self, folder: Path, status: Literal["failed", "unsupported"], reason: str) -> RunRecord:
+        """Write the record with a status that has no results, and why; returns that record."""
+        return self._close(folder, status=status, error=reason)
+
+    def _close(self, folder: Path, **changes: Any) -> RunRecord:
+        record = self.model_copy(update={"finished": datetime.now(UTC), **changes})
+        record.write(folder)
         return record
 
-    def fail(self, output: Path, error: BaseException) -> None:
-        """Write the record with status `failed` and what went wrong."""
-        text = str(error) or type(error).__name__
-        changes = {"status": "failed", "finished": datetime.now(UTC), "error": text}
-        self.model_copy(update=changes).write(output)
 
-
-def _folder(output: Path, protocol: Protocol, method: str, run_id: str) -> Path:
-    return output / protocol.task / protocol.split / folder_name(method) / run_id
+def json_schema() -> str:
+    """The JSON Schema of run.json, as committed in schema/run.schema.json."""
+    return json.dumps(RunRecord.model_json_schema(mode="serialization"), indent=2) + "\n"
 
 
 def folder_name(method: str) -> str:
@@ -215,20 +291,19 @@ def _write(path: Path, write: Callable[[Path], object]) -> None:
         raise UserError(f"{problem} in {path.parent}; {advice}") from None
 
 
-def plain(summary: Summary) -> dict[str, Any]:
-    """A table row as JSON holds it: estimates[metric][statistic] = {value, low, high}."""
-    estimates = {
-        metric: {name: estimate._asdict() for name, estimate in statistics.items()}
-        for metric, statistics in summary.estimates.items()
-    }
-    return {**summary._asdict(), "estimates": estimates}
+def _write_table(path: Path, table: pa.Table) -> None:
+    _write(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
 
 def read_episodes(folder: Path) -> pa.Table:
-    """The episode table in a run folder."""
-    return pq.ParquetFile(folder / EPISODES).read()
+    """The episode table in a run folder; raises UserError if it is missing or damaged."""
+    try:
+        return pq.ParquetFile(folder / EPISODES).read()
+    except (OSError, pa.ArrowInvalid) as error:
+        raise UserError(f"{folder / EPISODES} is missing or damaged: {error}") from None
 
 
+@cache
 def installed_packages() -> dict[str, str]:
     """Name and version of every installed package."""
     versions = {each.metadata["Name"]: each.version for each in distributions()}
@@ -252,31 +327,16 @@ def hash_files(files: Mapping[str, Path]) -> str:
     return total.hexdigest()
 
 
-def this_code(method: type[Generator]) -> Code:
-    """The code that is running, with the file of a method if that is not one of ours."""
-    files: dict[str, Path] = {}
-    if method.__module__.partition(".")[0] not in OUR_PACKAGES:
-        files["method"] = Path(inspect.getfile(method.sample))
+def this_code(plugin: Path | None = None) -> Code:
+    """The code that is running, with the file of a method that is not one of ours."""
+    files = {} if plugin is None else {"method": plugin}
     for package in OUR_PACKAGES:
         spec = find_spec(package)
         assert spec is not None and spec.origin is not None
         root = Path(spec.origin).parent
         files |= {f"{package}/{path.relative_to(root)}": path for path in root.rglob("*.py")}
-    code = Code(sha256=hash_files(files), commit=None, dirty=None)
-    # A package installed inside somebody else's checkout is not that checkout's code: ask whether git tracks this file.
-    if _git("ls-files", "--error-unmatch", __file__) is None:
-        return code
-    return code.model_copy(update={"commit": _git("rev-parse", "HEAD"), "dirty": bool(_git("status", "--porcelain"))})
-
-
-def _git(*arguments: str) -> str | None:
-    """What git says in the folder of this file; None if that is not a checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  fixed words
-    except FileNotFoundError:
-        return None
-    return answer.stdout.strip() if answer.returncode == 0 else None
+    now = commit()
+    return Code(sha256=hash_files(files), commit=now.sha, dirty=now.dirty)
 
 
 def this_machine() -> Hardware:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
+import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -10,25 +12,43 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from nnit_baselines import generator as generators
 from nnit_baselines.generator import WEIGHTS, Generator, SampleRequest
-from nnit_bench import records, statistics
+from nnit_bench import novelty, records, views
 from nnit_bench.protocol import Protocol
-from nnit_bench.records import Code, Identity, Method, RunRecord, Timings
-from nnit_bench.statistics import METRICS, Ints, Scores, Summary
-from nnit_zoo.architecture import Architecture
+from nnit_bench.records import Identity, Method, RunRecord, Timings, ZooVersion
+from nnit_bench.statistics import Estimate, Floats, Ints
+from nnit_bench.views import Scores
+from nnit_zoo.architecture import SPLITS, Architecture
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import sha256_of
+from nnit_zoo.files import MANIFEST, sha256_of
+from nnit_zoo.parallel import Backend
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.tasks.task import Task
+from nnit_zoo.zoo import Zoo
 
 Stage = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
 """Shows a stage of work: called with its name and size, gives a context that takes the number of newly done items."""
+Overwrite = Literal["never", "missing", "always"]
+UNITS = "units"
+"""Folder in a run's folder that keeps finished work until the run is finished."""
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How runs are carried out; none of this changes a number."""
+
+    output: Path
+    stage: Stage
+    workers: int = 2
+    parallel: Backend = "processes"
+    overwrite: Overwrite = "missing"
 
 
 @dataclass(frozen=True)
@@ -36,39 +56,85 @@ class Contestant:
     """A generator that is ready to sample, and how it got there."""
 
     method: Method
-    generator: Generator
+    kind: type[Generator]
+    generator: Generator | None
+    """None if it is of no use for what is asked."""
+    unsupported: str | None
+    """Why the generator cannot make what the protocol asks for, in words."""
     seconds: float
     """Wall-clock time that loading or fitting it took."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A finished run: its record, its table row, and whether it had been run before."""
+    """A run's record, and whether it had been run before."""
 
     record: RunRecord
-    summary: Summary
     folder: Path
     reused: bool
     zeroed: dict[str, int]
     """Why policies scored 0 without an episode, and how many of them."""
 
 
-class ZooRow(NamedTuple):
-    """The zoo's own row of the table: `policies` policies, scored by `episodes` episodes each."""
+@dataclass(frozen=True)
+class ZooRow:
+    """The zoo's own row: column -> `mean`, `top`, `worst`, over `policies` policies scored by `episodes` episodes."""
 
-    summary: Summary
+    estimates: dict[str, dict[str, Estimate]]
+    worst: str
     policies: int
     episodes: int
 
 
-def contestant(name: str, generator: Generator, seconds: float) -> Contestant:
-    """The contestant called `name`, with the settings and the checkpoint hash that identify it."""
+def enter(
+    name: str, zoo: Zoo, protocol: Protocol, *, checkpoint: str | None = None, steps: int | None = None
+) -> Contestant:
+    """The contestant called `name`, with what identifies it; raises UserError if it cannot be loaded or fitted."""
+    start = time.perf_counter()
+    kind = generators.get(name)
+    given = {key: value for key, value in (("checkpoint", checkpoint), ("steps", steps)) if value is not None}
+    able = kind.capabilities
+    reason = None
+    if protocol.is_joint and not able.joint:
+        reason = "does not choose architectures"
+    elif able.oracle and protocol.split not in SPLITS:
+        reason = f"the zoo has no policies of the split {protocol.split}"
+    if reason:
+        method = Method(name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None)
+        return Contestant(method, kind, None, reason, 0.0)
+    generator = generators.prepare(name, zoo, protocol.split, checkpoint)
+    if steps is not None:
+        set_steps(name, generator, steps)
+    method = describe(name, generator, given)
+    return Contestant(method, kind, generator, _lacks(generator, zoo, protocol), time.perf_counter() - start)
+
+
+def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
+    """What identifies a generator; `given` is what the command set on top of its defaults."""
     if not generator.capabilities.checkpoint:
-        return Contestant(Method(name=name, config={}, checkpoint_sha256=None), generator, seconds)
+        return Method(name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None)
     with TemporaryDirectory() as folder:  # also a checkpoint from the Hub is identified by what it is, not by its name
         generator.save_pretrained(folder)
         sha256 = sha256_of(Path(folder) / WEIGHTS)
-    return Contestant(Method(name=name, config=generator.config(), checkpoint_sha256=sha256), generator, seconds)
+    return Method(
+        name=name,
+        config=generator.config(),
+        given=given,
+        training=generator.training,
+        parameters=sum(tensor.numel() for tensor in generator.tensors().values()),
+        checkpoint_sha256=sha256,
+    )
+
+
+def _lacks(generator: Generator, zoo: Zoo, protocol: Protocol) -> str | None:
+    """What the protocol asks for that the generator does not support, in words."""
+    if protocol.is_joint:
+        return None if generator.capabilities.joint else "was not trained to choose architectures"
+    sizes = zoo.manifest.inputs, zoo.manifest.outputs
+    lacking = [name for name in protocol.policies if not generator.supports(Architecture.parse(name, *sizes))]
+    if len(lacking) == len(protocol.policies):
+        return f"supports no architecture of the split {protocol.split}"
+    return f"does not support {', '.join(lacking)}" if lacking else None
 
 
 def set_steps(name: str, generator: Generator, steps: int) -> None:
@@ -84,46 +150,94 @@ def set_steps(name: str, generator: Generator, steps: int) -> None:
     vars(generator)["settings"] = settings.model_copy(update={"sampling_steps": steps})
 
 
-def run(
-    task: Task, entrant: Contestant, identity: Identity, code: Code, output: Path, *, workers: int, stage: Stage
-) -> Outcome:
-    """Sample, score and record one method; raises UserError if the method or the task cannot, after recording that.
+def run(task: Task, zoo: Zoo, entrant: Contestant, protocol: Protocol, execution: Execution) -> Outcome:
+    """Sample, score and record one method, or find that it has been done.
 
-    An interrupted run leaves a record with status `started`, and is repeated from its beginning.
+    An interrupted run leaves a record with status `started` and its finished work; the same call goes on from there.
+    Raises UserError if the method or the task cannot, after recording that.
     """
-    protocol = identity.protocol
-    record = RunRecord.start(identity, code)
-    record.write(output)
+    ours = entrant.kind.__module__.partition(".")[0] in records.OUR_PACKAGES
+    code = records.this_code(None if ours else Path(inspect.getfile(entrant.kind)))
+    sha256 = sha256_of(zoo.folder / MANIFEST)
+    identity = Identity(
+        protocol=protocol,
+        method=entrant.method,
+        zoo_sha256=sha256,
+        code_sha256=code.sha256,
+        packages=records.numeric_packages(),
+    )
+    folder = identity.folder(execution.output)
+    if earlier := _earlier(folder, execution.overwrite):
+        return earlier
+    seen = zoo.index.filter(pc.equal(zoo.index["split"], "seen"))
+    version = ZooVersion(sha256=sha256, policies=len(seen), seeds=len(pc.unique(seen["ghn_seed"])))
+    record = RunRecord.start(identity, version, code)
+    record.write(folder)
+    if entrant.unsupported:
+        return Outcome(record.stop(folder, "unsupported", entrant.unsupported), folder, reused=False, zeroed={})
     try:
-        start = time.perf_counter()
-        batches = sample(task, entrant, protocol, stage)
-        sampled = time.perf_counter()
-        episodes = score(task, batches, protocol, workers, stage)
-        scored = time.perf_counter()
+        record = _carry_out(record, folder, task, zoo, entrant, execution)
     except Exception as error:
-        record.fail(output, error)
+        record.stop(folder, "failed", str(error) or type(error).__name__)
         raise
-    labels = {"method": entrant.method.name, "task": protocol.task, "split": protocol.split}
-    for name, value in labels.items():
-        episodes = episodes.append_column(name, pa.array([value] * len(episodes)))
-    episodes = episodes.select(records.EPISODE_SCHEMA.names)
-    timings = Timings(load_or_fit=entrant.seconds, sample=sampled - start, score=scored - sampled)
-    summary = summarise(episodes, protocol.top)
-    record = record.finish(output, episodes, timings, summary)
-    return Outcome(record, summary, record.folder(output), reused=False, zeroed=zeroed(episodes))
+    return Outcome(record, folder, reused=False, zeroed=zeroed(records.read_episodes(folder)))
 
 
-def finished(identity: Identity, output: Path) -> Outcome | None:
-    """The outcome of an identical run that has been finished before, if there is one."""
-    folder = identity.folder(output)
+def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:
+    """The outcome that is there already, if it stays; raises UserError for an unfinished one that must stay."""
     if not (folder / records.RECORD).is_file():
         return None
-    record = RunRecord.read(folder)
-    if record.status != "success":
+    if overwrite == "always":
+        shutil.rmtree(folder)
         return None
-    episodes = records.read_episodes(folder)
-    summary = summarise(episodes, identity.protocol.top)
-    return Outcome(record, summary, folder, reused=True, zeroed=zeroed(episodes))
+    record = RunRecord.read(folder)
+    if record.status in ("success", "unsupported"):
+        counts = zeroed(records.read_episodes(folder)) if record.status == "success" else {}
+        return Outcome(record, folder, reused=True, zeroed=counts)
+    if overwrite == "never":
+        raise UserError(f"the run in {folder} has not finished; --overwrite missing goes on with it")
+    return None
+
+
+def _carry_out(
+    record: RunRecord, folder: Path, task: Task, zoo: Zoo, entrant: Contestant, execution: Execution
+) -> RunRecord:
+    """Sample, measure and score; returns the finished record."""
+    protocol = record.protocol
+    start = time.perf_counter()
+    batches = sample(task, entrant, protocol, execution.stage)
+    sampled = time.perf_counter()
+    new, policies = novelty.measure(task, zoo, batches)
+    compared = time.perf_counter()
+    episodes = score(task, batches, protocol, execution, folder / UNITS)
+    scored = time.perf_counter()
+    labels = {
+        "method": entrant.method.name,
+        "training_seed": entrant.method.training.get("seed"),
+        "sampling_seed": protocol.seed,
+        "task": protocol.task,
+        "task_version": protocol.task_version,
+        "split": protocol.split,
+    }
+    for name, value in labels.items():
+        kind = records.EPISODE_SCHEMA.field(name).type
+        episodes = episodes.append_column(name, pa.array([value] * len(episodes), kind))
+    episodes = episodes.select(records.EPISODE_SCHEMA.names)
+    record = record.finish(
+        folder,
+        episodes,
+        policies,
+        timings=Timings(
+            load_or_fit=entrant.seconds,
+            sample=sampled - start,
+            novelty=compared - sampled,
+            score=scored - compared,
+        ),
+        results=views.summarise(episodes, protocol),
+        novelty=new,
+    )
+    shutil.rmtree(folder / UNITS, ignore_errors=True)
+    return record
 
 
 def zeroed(episodes: pa.Table) -> dict[str, int]:
@@ -135,17 +249,23 @@ def zeroed(episodes: pa.Table) -> dict[str, int]:
 def sample(task: Task, entrant: Contestant, protocol: Protocol, stage: Stage) -> list[PolicyBatch]:
     """The generated policies, one batch per architecture; raises UserError if the generator gives something else."""
     name, generator = entrant.method.name, entrant.generator
-    if not generator.capabilities.conditional:
-        raise UserError(f"{name} cannot be asked for an architecture, so it has no row on the {protocol.split} split")
+    assert generator is not None
     batches = []
     with stage(f"{name}: sampling policies", sum(protocol.policies.values())) as advance:
         for text, count in protocol.policies.items():
-            architecture = Architecture.parse(text, task.inputs, task.outputs)
-            batch = generator.sample(SampleRequest(architecture, count, sample_seed(protocol.seed, text)))
-            if batch.architecture != architecture or len(batch) != count:
-                given = f"{len(batch)} of {batch.architecture}"
-                raise UserError(f"{name} was asked for {count} policies of {architecture} but gave {given}")
-            batches.append(batch)
+            seed = sample_seed(protocol.seed, text)
+            if protocol.is_joint:
+                batches += generator.sample_joint(count, seed)
+                given = sum(map(len, batches))
+                if given != count:
+                    raise UserError(f"{name} was asked for {count} policies but gave {given}")
+            else:
+                architecture = Architecture.parse(text, task.inputs, task.outputs)
+                batch = generator.sample(SampleRequest(architecture, count, seed))
+                if batch.architecture != architecture or len(batch) != count:
+                    gave = f"{len(batch)} of {batch.architecture}"
+                    raise UserError(f"{name} was asked for {count} policies of {architecture} but gave {gave}")
+                batches.append(batch)
             advance(count)
     return batches
 
@@ -155,44 +275,50 @@ def sample_seed(seed: int, architecture: str) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed} {architecture}".encode()).digest()[:4], "big") % 2**31
 
 
-def score(task: Task, batches: Sequence[PolicyBatch], protocol: Protocol, workers: int, stage: Stage) -> pa.Table:
-    """The episodes of all policies in phase `select`, then those of the top ones in phase `report`."""
+def score(
+    task: Task, batches: Sequence[PolicyBatch], protocol: Protocol, execution: Execution, store: Path
+) -> pa.Table:
+    """The episodes of all policies in phase `select`, then those of the best in phase `report`, if there is one."""
     policies = [policy for batch in batches for policy in batch]
 
-    def phase(name: str, label: str, batches: Sequence[PolicyBatch], numbers: Ints) -> pa.Table:
-        seeds = protocol.seeds(name)
-        with stage(label, len(numbers) * len(seeds)) as advance:
-            table = task.evaluate(batches, seeds, workers=workers, progress=advance)
+    def phase(name: str, label: str, batches: Sequence[PolicyBatch], numbers: Ints, seeds: range) -> pa.Table:
+        with execution.stage(label, len(numbers) * len(seeds)) as advance:
+            table = task.evaluate(
+                batches,
+                seeds,
+                workers=execution.workers,
+                parallel=execution.parallel,
+                store=store,
+                progress=advance,
+            )
         # The task numbers what it is given from 0; a policy keeps its number through both phases.
         table = table.set_column(0, "policy", pc.take(pa.array(numbers, pa.int32()), table["policy"]))
+        table = table.rename_columns({"seed": "episode_seed"})
         return table.append_column("phase", pa.array([name] * len(table)))
 
-    select = phase("select", f"{protocol.task}: scoring episodes", batches, np.arange(len(policies)))
-    best = statistics.best(statistics.scores(select), protocol.top)
-    again = f"{protocol.task}: scoring the top {len(best)} again"
-    return pa.concat_tables([select, phase("report", again, [policies[number] for number in best], best)])
-
-
-def summarise(episodes: pa.Table, top: int) -> Summary:
-    """The table row of a finished run."""
-    select, report = (
-        statistics.scores(episodes.filter(pc.equal(episodes["phase"], phase))) for phase in ("select", "report")
-    )
-    return statistics.summarise(select, report, top)
+    label = f"{protocol.task}: scoring episodes"
+    select = phase("select", label, batches, np.arange(len(policies)), protocol.select.seeds)
+    if protocol.report is None:
+        return select
+    best = views.ranked(views.scores(select, protocol.metrics), protocol.metrics)[: protocol.top]
+    again, chosen = f"{protocol.task}: scoring the top {len(best)} again", [policies[number] for number in best]
+    return pa.concat_tables([select, phase("report", again, chosen, best, protocol.report.seeds)])
 
 
 def zoo_row(index: pa.Table, protocol: Protocol) -> ZooRow | None:
-    """The scores of the zoo's own policies on the same architectures; None if it has none.
+    """The scores of the zoo's own policies on the same architectures, on `joint` of the seen; None if it has none.
 
-    They were measured when the zoo was built, on other episodes.
+    They were measured when the zoo was built, on other episodes, of which the index has the means.
     """
-    wanted = pa.array(list(protocol.policies))
-    rows = index.filter(
-        pc.and_(pc.equal(index["split"], protocol.split), pc.is_in(index["architecture"], value_set=wanted))
-    )
+    chosen = pc.equal(index["split"], "seen" if protocol.is_joint else protocol.split)
+    if not protocol.is_joint:
+        chosen = pc.and_(chosen, pc.is_in(index["architecture"], value_set=pa.array(list(protocol.policies))))
+    rows = index.filter(chosen)
     if not len(rows):
         return None
-    values = {metric: rows[metric].to_numpy().astype(np.float64)[:, None] for metric in METRICS}
-    table = Scores(values, np.arange(len(rows)), np.array(rows["architecture"].to_pylist()))
-    summary = statistics.summarise(table, None, protocol.top)
-    return ZooRow(summary, len(rows), int(pc.min(rows["episodes"]).as_py()))
+    values: dict[str, Floats] = {
+        each.column: rows[each.column].to_numpy().astype(np.float64)[:, None] for each in protocol.metrics
+    }
+    table = Scores(values, np.arange(len(rows)), np.array(rows["architecture"].to_pylist()), np.zeros(1, np.int64))
+    estimates, worst = views.of_means(table, protocol)
+    return ZooRow(estimates, worst, len(rows), int(pc.min(rows["episodes"]).as_py()))

@@ -1,21 +1,32 @@
 """A task that is scored by a formula, a generator that makes networks from its seed, and a small zoo: no simulator."""
 
+import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from pydantic import BaseModel
+from safetensors.torch import save_file
 
 from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest
-from nnit_bench.protocol import Protocol, policies_per_architecture
+from nnit_bench import records
+from nnit_bench.protocol import Protocol
+from nnit_bench.records import Identity, Method, RunRecord, ZooVersion
+from nnit_bench.results import StoredRun
+from nnit_bench.views import summarise
+from nnit_zoo.architecture import Architecture, hidden_widths
+from nnit_zoo.build.ghn import GHN
 from nnit_zoo.files import INDEX_SCHEMA
+from nnit_zoo.materialise import materialise, write_manifest
 from nnit_zoo.policy import PolicyBatch
-from nnit_zoo.tasks.task import EPISODE_SCHEMA, Task
-from nnit_zoo.zoo import TrainingView
+from nnit_zoo.tasks.task import EPISODE_SCHEMA, Metric, Task
+from nnit_zoo.zoo import TrainingView, Zoo
 
 
 class Formula(Task):
@@ -25,11 +36,18 @@ class Formula(Task):
     version = 1
     inputs = 3
     outputs = 2
-    success_threshold = 0.5
-    return_threshold = 0.5
+    metrics = (
+        Metric("success_at_end", "success at end", "%"),
+        Metric("success_once", "success once", "%"),
+        Metric("return", "return", ""),
+    )
+    thresholds = {"success_at_end": 0.5, "return": 0.5}  # noqa: RUF012
 
     def __init__(self) -> None:
         self.calls: list[tuple[int, list[int]]] = []
+
+    def probe_states(self) -> torch.Tensor:
+        return torch.randn(50, self.inputs, generator=torch.Generator().manual_seed(0))
 
     def evaluate(
         self,
@@ -37,6 +55,8 @@ class Formula(Task):
         seeds: Sequence[int],
         *,
         workers: int = 2,
+        parallel: str = "processes",
+        store: Path | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> pa.Table:
         self.check(policies, seeds)
@@ -55,6 +75,26 @@ class Formula(Task):
         return pa.Table.from_pylist([dict(zip(EPISODE_SCHEMA.names, row, strict=True)) for row in rows], EPISODE_SCHEMA)
 
 
+class Digits(Formula):
+    """A task like a test set: eight episodes, no notion of success, and a return between 0 and 1."""
+
+    name = "Digits-v1"
+    metrics = (Metric("return", "accuracy", "%"),)
+    episodes = 8
+    episode_seeds = range(8)
+
+    def phase_seeds(self, phase: str, episodes: int) -> range:
+        return range(episodes) if phase == "select" else range(0)
+
+    def evaluate(self, *arguments: Any, **options: Any) -> pa.Table:
+        table = super().evaluate(*arguments, **options)
+        share = pa.compute.divide(table["return"], pa.scalar(40, pa.float32()))
+        nothing = pa.nulls(len(table), pa.bool_())
+        for name, values in (("return", share), ("success_once", nothing), ("success_at_end", nothing)):
+            table = table.set_column(EPISODE_SCHEMA.get_field_index(name), EPISODE_SCHEMA.field(name), values)
+        return table
+
+
 class Settings(BaseModel):
     sampling_steps: int = 4
 
@@ -62,21 +102,31 @@ class Settings(BaseModel):
 class Seeded(Generator):
     """Networks whose first bias, their skill, is uniform in [0, 1] and follows from the request's seed alone."""
 
-    capabilities = Capabilities()
+    capabilities = Capabilities(joint=True, depths=(4,))
 
     def __init__(self) -> None:
         super().__init__()
         self.settings = Settings()
+        self.training = {"seed": 7, "seconds": 1}
 
     def fit(self, view: TrainingView, run: Run | None = None) -> None:
         pass
 
     def sample(self, request: SampleRequest) -> PolicyBatch:
-        assert request.architecture is not None
         draws = torch.Generator().manual_seed(request.seed)
-        layers = [torch.zeros(request.policies, *shape) for shape in request.architecture.block_shapes]
+        layers = [
+            0.1 * torch.randn(request.policies, *shape, generator=draws) for shape in request.architecture.block_shapes
+        ]
         layers[0][:, 0, -1] = torch.rand(request.policies, generator=draws)
         return PolicyBatch(request.architecture, tuple(layers))
+
+    def sample_joint(self, policies: int, seed: int) -> list[PolicyBatch]:
+        names = [hidden_widths("seen")[0], hidden_widths("unseen")[0], "8-8-8-8"]
+        counts = [policies - 3, 2, 1]
+        return [
+            self.sample(SampleRequest(Architecture.parse(name, 3, 2), count, seed))
+            for name, count in zip(names, counts, strict=True)
+        ]
 
     def config(self) -> dict[str, Any]:
         return self.settings.model_dump()
@@ -91,14 +141,46 @@ def task() -> Formula:
 
 
 @pytest.fixture
+def digits() -> Digits:
+    return Digits()
+
+
+@pytest.fixture
 def generator() -> Seeded:
     return Seeded()
 
 
 @pytest.fixture
-def protocol() -> Protocol:
-    policies = policies_per_architecture("unseen", 3)
-    return Protocol(task="Formula-v1", task_version=1, split="unseen", policies=policies, episodes=6, top=4)
+def protocol(task: Formula) -> Protocol:
+    return Protocol.of(task, "unseen", policies=3, episodes=6).model_copy(update={"top": 4})
+
+
+def embed_zoo(folder: Path, task: Task, seeds: Sequence[int], splits: dict[str, Sequence[str]]) -> Path:
+    """A folder like a task's in the package: random hypernetworks, of which every policy is kept."""
+    folder.mkdir(parents=True)
+    ghns = [GHN(task.inputs, task.outputs, seed).state_dict() for seed in seeds]
+    stacked = {name: torch.stack([ghn[name] for ghn in ghns]).half().contiguous() for name in ghns[0]}
+    metadata = {"task": task.name, "inputs": task.inputs, "outputs": task.outputs, "ghn_seeds": list(seeds)}
+    save_file(stacked, folder / "ghns.safetensors", {"nnit": json.dumps(metadata)})
+    scores = {"success_once": 1.0, "success_at_end": 0.9, "return": 36.0, "episodes": 64, "kept": True}
+    rows = [
+        {"architecture": name, "ghn_seed": seed, "split": split, **scores}
+        for split, names in splits.items()
+        for name in names
+        for seed in seeds
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), folder / "selection.parquet")
+    write_manifest(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def zoo(tmp_path_factory: pytest.TempPathFactory) -> Zoo:
+    """Two seeds of the corpus and two held-out ones, on two seen and all unseen architectures."""
+    folder = tmp_path_factory.mktemp("zoo")
+    splits = {"seen": ["64-64-64-64", "32-16-64-32"], "unseen": hidden_widths("unseen")}
+    materialise(embed_zoo(folder / "embedded", Formula(), [0, 1, 128, 129], splits), folder / "zoo")
+    return Zoo.open(folder / "zoo")
 
 
 @pytest.fixture
@@ -143,3 +225,46 @@ def plugin(tmp_path: Path) -> Path:
         "        return PolicyBatch(request.architecture, layers)\n"
     )
     return path
+
+
+def store_run(folder: Path, name: str, protocol: Protocol, success: np.ndarray) -> StoredRun:
+    """A finished run whose policies went as `success` [policies, episodes] says; those of `joint` are all alike."""
+    names = [each for each, count in protocol.policies.items() for _ in range(count)]
+    names = ["16-16-16-32" if protocol.is_joint else each for each in names]
+    rows = []
+    for (policy, column), value in np.ndenumerate(success):
+        row = dict.fromkeys(records.EPISODE_SCHEMA.names) | {"policy": policy, "phase": "select"}
+        row |= {"architecture": names[policy], "episode_seed": protocol.select.first + column}
+        if "success_at_end" in [metric.column for metric in protocol.metrics]:
+            row |= {"success_at_end": bool(value), "success_once": bool(value), "return": 40.0 * value}
+        rows.append({"return": value} | {name: each for name, each in row.items() if each is not None})
+    episodes = pa.Table.from_pylist(rows, records.EPISODE_SCHEMA)
+    method = Method(name=name, config={}, given={}, training={}, parameters=None, checkpoint_sha256=None)
+    identity = Identity(protocol=protocol, method=method, zoo_sha256="z", code_sha256="c", packages={})
+    code = records.Code(sha256="c", commit=None, dirty=None)
+    place = identity.folder(folder)
+    record = RunRecord.start(identity, ZooVersion(sha256="z", policies=1, seeds=1), code)
+    timings = records.Timings(load_or_fit=0, sample=0, novelty=0, score=0)
+    novelty = records.Novelty(
+        same_architecture=records.Distance(median=0.02, heldout=1.2, ratio=0.02 / 1.2),
+        any_architecture=None,
+        actions=None,
+        copies=0,
+        pairwise_l2=None,
+        pairwise_cosine=None,
+    )
+    results = summarise(episodes, protocol)
+    record = record.finish(place, episodes, pa.table({}), timings=timings, results=results, novelty=novelty)
+    return StoredRun(record, place)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Callable[..., StoredRun]:
+    """Stores finished runs below the test's folder."""
+    return partial(store_run, tmp_path)
+
+
+@pytest.fixture
+def embed() -> Callable[..., Path]:
+    """Makes a folder like a task's in the package."""
+    return embed_zoo

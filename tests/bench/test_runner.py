@@ -1,56 +1,77 @@
 """A run with a task and a generator that need no simulator: what it scores, what it leaves behind, what it reuses."""
 
 import errno
-import json
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
-from nnit_bench import records, runner
+from nnit_bench import records, runner, views
 from nnit_bench.protocol import Protocol
-from nnit_bench.records import Identity, RunRecord
+from nnit_bench.records import RunRecord
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.errors import UserError
+
+Run = Callable[..., runner.Outcome]
 
 
 def silent(label: str, total: int) -> Any:
     return nullcontext(lambda done: None)
 
 
-def identify(protocol: Protocol, generator: Any) -> Identity:
-    method = runner.contestant("seeded", generator, 0.0).method
-    return Identity(protocol=protocol, method=method, zoo_sha256="z", code_sha256="c", packages={"torch": "2"})
+def contestant(generator: Any) -> runner.Contestant:
+    return runner.Contestant(runner.describe("seeded", generator, {}), type(generator), generator, None, 0.0)
 
 
 @pytest.fixture
-def run(task: Any, generator: Any, protocol: Protocol, tmp_path: Path) -> Callable[..., runner.Outcome]:
-    def run_it(generator: Any = generator, protocol: Protocol = protocol) -> runner.Outcome:
-        entrant = runner.contestant("seeded", generator, 0.0)
-        code = records.Code(sha256="c", commit=None, dirty=None)
-        identity = identify(protocol, generator)
-        return runner.run(task, entrant, identity, code, tmp_path, workers=1, stage=silent)
+def execution(tmp_path: Path) -> runner.Execution:
+    return runner.Execution(output=tmp_path, stage=silent, workers=1)
+
+
+@pytest.fixture
+def run(task: Any, generator: Any, protocol: Protocol, zoo: Any, execution: runner.Execution) -> Run:
+    def run_it(**changes: Any) -> runner.Outcome:
+        given = {"task": task, "zoo": zoo, "entrant": contestant(generator), "protocol": protocol} | changes
+        how = replace(execution, **{"overwrite": given.pop("overwrite", "missing")})
+        return runner.run(**given, execution=how)
 
     return run_it
 
 
-def test_every_episode_is_on_record_and_gives_back_the_results(run: Any, task: Any, protocol: Protocol) -> None:
+def test_every_episode_is_on_record_and_gives_back_the_results(run: Run, task: Any, protocol: Protocol) -> None:
     outcome = run()
     episodes = records.read_episodes(outcome.folder)
     assert episodes.schema.equals(records.EPISODE_SCHEMA)
     assert episodes.num_rows == 8 * 3 * 6 + 4 * 6
-    assert task.calls == [(24, list(protocol.seeds("select"))), (4, list(protocol.seeds("report")))]
+    assert protocol.report is not None
+    assert task.calls == [(24, list(protocol.select.seeds)), (4, list(protocol.report.seeds))]
     record = RunRecord.read(outcome.folder)
-    assert record.status == "success" and record.protocol == protocol
-    again = records.plain(runner.summarise(episodes, protocol.top))
-    assert json.loads(json.dumps(again)) == record.results
+    assert record == outcome.record and record.status == "success" and record.protocol == protocol
+    assert views.summarise(episodes, protocol) == record.results
+    first = episodes.to_pylist()[0]
+    assert (first["method"], first["training_seed"], first["task_version"]) == ("seeded", 7, 1)
+    policies = pq.ParquetFile(outcome.folder / records.POLICIES).read()
+    assert policies["policy"].to_pylist() == list(range(24))
 
 
-def test_the_best_are_scored_again_under_their_own_numbers(run: Any) -> None:
-    rows = records.read_episodes(run().folder).to_pylist()
+def test_identical_inputs_give_identical_files(run: Run) -> None:
+    def content(outcome: runner.Outcome) -> tuple[bytes, bytes, RunRecord]:
+        changing = {"started", "finished", "timings"}
+        record = outcome.record.model_copy(update=dict.fromkeys(changing))
+        tables = ((outcome.folder / name).read_bytes() for name in (records.EPISODES, records.POLICIES))
+        return *tables, record
+
+    assert content(run()) == content(run(overwrite="always"))
+
+
+def test_the_best_are_scored_again_under_their_own_numbers(run: Run) -> None:
+    outcome = run()
+    rows = records.read_episodes(outcome.folder).to_pylist()
     skill = {row["policy"]: row["return"] for row in rows if row["phase"] == "select"}
     names = {row["policy"]: row["architecture"] for row in rows if row["phase"] == "select"}
     again = {row["policy"] for row in rows if row["phase"] == "report"}
@@ -60,7 +81,7 @@ def test_the_best_are_scored_again_under_their_own_numbers(run: Any) -> None:
 
 
 def test_an_architectures_policies_do_not_depend_on_the_others(task: Any, generator: Any, protocol: Protocol) -> None:
-    entrant = runner.contestant("seeded", generator, 0.0)
+    entrant = contestant(generator)
     alone = protocol.model_copy(update={"policies": {"64-64-64-16": 3}})
     everything = {str(batch.architecture): batch for batch in runner.sample(task, entrant, protocol, silent)}
     (one,) = runner.sample(task, entrant, alone, silent)
@@ -69,46 +90,84 @@ def test_an_architectures_policies_do_not_depend_on_the_others(task: Any, genera
     assert not one.flat().equal(reseeded[0].flat())
 
 
-def test_an_identical_run_is_found_again_and_no_other(
-    run: Any, generator: Any, protocol: Protocol, tmp_path: Path
-) -> None:
-    outcome = run()
-    found = runner.finished(identify(protocol, generator), tmp_path)
-    assert found is not None and found.reused
-    assert found.summary == outcome.summary
-    assert runner.finished(identify(protocol.model_copy(update={"seed": 1}), generator), tmp_path) is None
+def test_the_generator_chooses_on_joint(run: Run, task: Any) -> None:
+    outcome = run(protocol=Protocol.of(task, "joint", policies=10, episodes=4))
+    found = outcome.record.results
+    assert found is not None and found.joint is not None
+    assert (found.joint.distinct, found.joint.unseen, found.joint.outside) == (3, 1, 1)
+    assert records.read_episodes(outcome.folder).filter(pa.compute.field("phase") == "select").num_rows == 40
+
+
+def test_a_test_set_is_scored_once(run: Run, digits: Any) -> None:
+    outcome = run(task=digits, protocol=Protocol.of(digits, "unseen", policies=1))
+    episodes = records.read_episodes(outcome.folder)
+    assert set(episodes["phase"].to_pylist()) == {"select"} and episodes["success_once"].null_count == 64
+    found = outcome.record.results
+    assert found is not None and list(found.estimates) == ["return"]
+    assert "top_heldout" in found.estimates["return"]
+
+
+def test_what_a_method_cannot_is_unsupported_and_not_zero(run: Run, task: Any, zoo: Any, generator: Any) -> None:
+    deep = Protocol.of(task, "deep", policies=1, episodes=2)
+    lacking = runner._lacks(generator, zoo, deep)
+    assert lacking == "supports no architecture of the split deep"
+    mixed = deep.model_copy(update={"policies": {"32-32-32-32": 1, "32-32": 1}})
+    assert runner._lacks(generator, zoo, mixed) == "does not support 32-32"
+    outcome = run(protocol=deep, entrant=replace(contestant(generator), unsupported=lacking))
+    assert outcome.record.status == "unsupported" and outcome.record.results is None
+    assert run(protocol=deep, entrant=replace(contestant(generator), unsupported=lacking)).reused
+    joint = runner.enter("crop", zoo, Protocol.of(task, "joint"))
+    assert joint.unsupported == "does not choose architectures"
+    oracle = runner.enter("ghn-oracle", zoo, Protocol.of(task, "wide"))
+    assert oracle.unsupported == "the zoo has no policies of the split wide"
+
+
+def test_an_identical_run_is_found_again_and_no_other(run: Run, protocol: Protocol, generator: Any) -> None:
+    first = run()
+    found = run()
+    assert found.reused and found.record == first.record
+    assert not run(protocol=protocol.model_copy(update={"seed": 1})).reused
+    assert not run(overwrite="always").reused
     runner.set_steps("seeded", generator, 9)
-    assert runner.finished(identify(protocol, generator), tmp_path) is None
+    assert not run(entrant=contestant(generator)).reused
 
 
-def test_an_interrupted_run_is_repeated(
-    run: Any, task: Any, generator: Any, protocol: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_interrupted_run_keeps_its_work_and_is_finished(
+    run: Run, task: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*arguments: Any, **options: Any) -> pa.Table:
+    stores = []
+
+    def interrupt(*arguments: Any, store: Path, **options: Any) -> pa.Table:
+        stores.append(store)
+        store.mkdir(parents=True, exist_ok=True)
+        (store / "unit").write_text("")
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(task, "evaluate", interrupt)
-        run()
-    identity = identify(protocol, generator)
-    assert RunRecord.read(identity.folder(tmp_path)).status == "started"
-    assert runner.finished(identity, tmp_path) is None
+    for _ in range(2):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(task, "evaluate", interrupt)
+            run()
+    assert stores[0] == stores[1] and (stores[0] / "unit").exists()
+    folder = stores[0].parent
+    assert RunRecord.read(folder).status == "started"
+    with pytest.raises(UserError, match="has not finished; --overwrite missing"):
+        run(overwrite="never")
     assert run().record.status == "success"
+    assert sorted(path.name for path in folder.iterdir()) == ["episodes.parquet", "policies.parquet", "run.json"]
 
 
-def test_a_failed_run_says_why(
-    run: Any, generator: Any, protocol: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_run_says_why(run: Run, generator: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     wrong = generator.sample(runner.SampleRequest(Architecture(3, (16, 16), 2), 3, 0))
     monkeypatch.setattr(generator, "sample", lambda request: wrong)
     with pytest.raises(UserError, match=r"asked for 3 policies of .* but gave 3 of 16-16"):
         run()
-    record = RunRecord.read(identify(protocol, generator).folder(tmp_path))
+    (path,) = tmp_path.rglob("run.json")
+    record = RunRecord.read(path.parent)
     assert record.status == "failed"
     assert record.error is not None and "gave 3 of 16-16" in record.error
 
 
-def test_policies_that_are_not_finite_are_counted(run: Any, generator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_policies_that_are_not_finite_are_counted(run: Run, generator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     sample = generator.sample
 
     def broken(request: runner.SampleRequest) -> Any:
@@ -119,10 +178,13 @@ def test_policies_that_are_not_finite_are_counted(run: Any, generator: Any, monk
     monkeypatch.setattr(generator, "sample", broken)
     outcome = run()
     assert outcome.zeroed == {"not finite": 8}
-    assert outcome.summary.estimates["success_at_end"]["mean"].value < 0.67
+    assert outcome.record.results is not None
+    assert outcome.record.results.estimates["success_at_end"]["mean"].value < 0.67
+    policies = pq.ParquetFile(outcome.folder / records.POLICIES).read()
+    assert policies["any_architecture"].null_count == policies["actions"].null_count == 8
 
 
-def test_a_full_disk_is_told(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*arguments: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -131,11 +193,11 @@ def test_a_full_disk_is_told(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         run()
 
 
-def test_a_damaged_record_is_told(run: Any, generator: Any, protocol: Protocol, tmp_path: Path) -> None:
-    outcome = run()
-    (outcome.folder / "run.json").write_text('{"schema_version": 1, "run_id"')
+def test_a_damaged_record_is_told(run: Run) -> None:
+    (run().folder / "run.json").write_text('{"schema_version": 1, "run_id"')
     with pytest.raises(UserError, match=r"run\.json is damaged"):
-        runner.finished(identify(protocol, generator), tmp_path)
+        run()
+    assert not run(overwrite="always").reused
 
 
 def test_steps_of_a_method_without_steps(generator: Any) -> None:
@@ -148,9 +210,11 @@ def test_steps_of_a_method_without_steps(generator: Any) -> None:
 def test_the_zoos_row_holds_the_same_architectures_only(zoo_index: pa.Table, protocol: Protocol) -> None:
     row = runner.zoo_row(zoo_index, protocol)
     assert row is not None
-    assert (row.policies, row.episodes, row.summary.worst) == (4, 64, "16-16-16-32")
-    assert row.summary.estimates["success_at_end"]["mean"].value == 0.75
+    assert (row.policies, row.episodes, row.worst) == (4, 64, "16-16-16-32")
+    assert row.estimates["success_at_end"]["mean"].value == 0.75
     only = protocol.model_copy(update={"policies": {"32-32-16-64": 3}})
     narrow = runner.zoo_row(zoo_index, only)
-    assert narrow is not None and narrow.summary.estimates["return"]["mean"].value == 35
+    assert narrow is not None and narrow.estimates["return"]["mean"].value == 35
     assert runner.zoo_row(zoo_index, protocol.model_copy(update={"policies": {"64-64-64-16": 3}})) is None
+    chosen = runner.zoo_row(zoo_index, protocol.model_copy(update={"split": "joint", "policies": {"any": 3}}))
+    assert chosen is not None and chosen.policies == 1

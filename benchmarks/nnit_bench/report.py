@@ -1,0 +1,244 @@
+"""`nnit-bench report`: all stored results as Markdown, JSON, CSV and figures."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nnit_bench import paper, results, views
+from nnit_bench.compare import differ
+from nnit_bench.protocol import SPLITS, Metric
+from nnit_bench.results import FOLDERS, Folders, StoredRun
+from nnit_bench.statistics import Estimate
+from nnit_zoo.atomic import write_atomically
+from nnit_zoo.cli import Json
+from nnit_zoo.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BARS = 16  # architectures that still fit a figure as bars
+Group = list[StoredRun]
+"""The runs of one task and split, a method each, the best first."""
+
+
+def report(*, folders: Folders = FOLDERS, output: Path = Path("report"), as_json: Json = False) -> None:
+    """Write all stored results as tables and figures: of every method its newest whole run on each task and split.
+
+    Args:
+        folders: Folders to look for runs in; may be repeated.
+        output: Folder to write report.md, report.json, report.csv and the figures to.
+        as_json: Print the content of report.json.
+    """
+    runs = list(results.latest(results.find(folders)).values())
+    if not runs:
+        raise UserError(f"no finished runs in {', '.join(map(str, folders))}; make one with: nnit-bench run")
+    groups = _grouped(runs)
+    content = json.dumps([_plain(run) for group in groups for run in group], indent=2) + "\n"
+    figures = dict(_figures(groups))
+    _write(output / "report.json", content)
+    _write(output / "report.csv", _csv(groups))
+    _write(output / "report.md", _markdown(groups, figures))
+    for name, figure in figures.items():
+        write_atomically(output / name, _saver(figure))
+    written = ["report.md", "report.json", "report.csv", *figures]
+    sys.stdout.write(content if as_json else "".join(f"{output / name}\n" for name in written))
+
+
+def _grouped(runs: Sequence[StoredRun]) -> list[Group]:
+    """The runs by task and split in the order of SPLITS, each group from the highest mean headline score."""
+    order: list[str] = [*SPLITS]
+    groups: dict[tuple[str, int], Group] = {}
+    for run in sorted(runs, key=_rank):
+        protocol = run.record.protocol
+        groups.setdefault((protocol.task, order.index(protocol.split)), []).append(run)
+    return [groups[key] for key in sorted(groups)]
+
+
+def _rank(run: StoredRun) -> tuple[float, str]:
+    found = run.record.results
+    return (-found.estimates[_headline(run).column]["mean"].value if found else 1.0), run.record.method.name
+
+
+def _headline(run: StoredRun) -> Metric:
+    return run.record.protocol.metrics[0]
+
+
+def _plain(run: StoredRun) -> dict[str, Any]:
+    return {"folder": str(run.folder), **run.record.model_dump(mode="json", exclude={"packages"})}
+
+
+def _csv(groups: Sequence[Group]) -> str:
+    """A line per estimate."""
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(["task", "split", "method", "run_id", "architecture", "metric", "statistic", "value", "low", "high"])
+    for run in (run for group in groups for run in group if run.record.results):
+        found = run.record.results
+        assert found is not None
+        protocol = run.record.protocol
+        start = [protocol.task, protocol.split, run.record.method.name, run.record.run_id]
+        for metric, statistics in found.estimates.items():
+            for name, each in statistics.items():
+                place = found.worst if name == "worst" else ""
+                lines.writerow([*start, place, metric, name, each.value, each.low, each.high])
+        for architecture, metrics in found.architectures.items():
+            for metric, each in metrics.items():
+                lines.writerow([*start, architecture, metric, "mean", each.value, each.low, each.high])
+    return text.getvalue()
+
+
+def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
+    parts = ["# Results\n"]
+    for group in groups:
+        protocol = group[0].record.protocol
+        metric = protocol.metrics[0]
+        parts.append(f"## {protocol.task}, {protocol.split}\n")
+        parts.append(
+            f"Headline: {metric.label}{' in %' if metric.unit else ''}, with 95 % intervals. `tied`: cannot be told "
+            "apart from the first row. `nearest known`: median distance (relative L2) to the nearest policy that a "
+            "known seed has for the architecture; in brackets as a multiple of that of held-out seeds.\n"
+        )
+        heading = ["method", "mean", f"top-{protocol.top}", "held out", "worst architecture", "tied", "nearest known"]
+        parts.append("| " + " | ".join(heading) + " |\n|---|" + "---:|" * (len(heading) - 1))
+        parts += [_row(run, group, metric) for run in group]
+        parts.append("")
+        parts += [f"![{name}]({name})\n" for name in figures if name in _figure_names(group)]
+    latest = {
+        (run.record.protocol.task, run.record.protocol.split, run.record.method.name): run
+        for group in groups
+        for run in group
+    }
+    parts.append("## The paper's tables\n")
+    parts += [paper.markdown(table) for make in paper.TABLES.values() for table in make(latest)]
+    return "\n".join(parts)
+
+
+def _row(run: StoredRun, group: Group, metric: Metric) -> str:
+    record = run.record
+    name = record.method.label + _size(run, group)
+    if record.results is None:
+        return f"| {name} | {record.status}: {record.error} |" + " |" * 5
+    numbers = record.results.estimates[metric.column]
+    cells = [_cell(numbers.get(name), metric) for name in ("mean", "top", "top_heldout", "worst")]
+    if record.results.worst:
+        cells[-1] += f" {record.results.worst}"
+    first = group[0]
+    tied = run is not first and record.protocol.measures_like(first.record.protocol)
+    tied = tied and not differ(first, run)[0].separable
+    same = record.novelty and record.novelty.same_architecture
+    ratio = "" if not same or same.ratio is None else f" ({same.ratio:.2f})"
+    distance = f"{same.median:.1%}{ratio}" if same else "-"
+    return "| " + " | ".join([name, *cells, "tied" if tied else "", distance]) + " |"
+
+
+def _size(run: StoredRun, group: Group) -> str:
+    """How large a run is, if it is smaller than others of its group."""
+    sizes = [(sum(each.policies.values()), each.select.count) for each in (one.record.protocol for one in group)]
+    mine = sizes[group.index(run)]
+    return "" if mine == max(sizes) else f" ({mine[0]} policies, {mine[1]} episodes each)"
+
+
+def _cell(estimate: Estimate | None, metric: Metric) -> str:
+    if estimate is None:
+        return "-"
+    scale = 100 if metric.unit == "%" else 1
+    return f"{estimate.value * scale:.1f} ({estimate.low * scale:.1f} to {estimate.high * scale:.1f})"
+
+
+def _figure_names(group: Group) -> tuple[str, str]:
+    protocol = group[0].record.protocol
+    return (
+        f"architectures-{protocol.task}-{protocol.split}.png",
+        f"top-{protocol.task}-{protocol.split}.png",
+    )
+
+
+def _figures(groups: Sequence[Group]) -> Iterator[tuple[str, Figure]]:
+    try:
+        import matplotlib  # noqa: F401, PLC0415  an optional extra
+    except ImportError:
+        raise UserError("figures need matplotlib; run: pip install 'nnit[figures]'") from None
+    for group in groups:
+        scored = [run for run in group if run.record.results]
+        if scored:
+            by_architecture, top = _figure_names(group)
+            if not scored[0].record.protocol.is_joint:
+                yield by_architecture, _by_architecture(scored)
+            yield top, _top_curves(scored)
+
+
+def _by_architecture(runs: Sequence[StoredRun]) -> Figure:
+    """The headline of every architecture: bars with intervals, or for many architectures dots without."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    metric = _headline(runs[0])
+    scale = 100 if metric.unit == "%" else 1
+    names = list(runs[0].record.protocol.policies)
+    many = len(names) > BARS
+    figure = Figure(figsize=(12 if many else 8, 4), layout="constrained")
+    axes = figure.subplots()
+    width = 0.8 / len(runs)
+    for number, run in enumerate(runs):
+        found = run.record.results
+        assert found is not None
+        there = [name for name in names if name in found.architectures]
+        of = [found.architectures[name][metric.column] for name in there]
+        places = [names.index(name) + (0 if many else (number - (len(runs) - 1) / 2) * width) for name in there]
+        heights = [each.value * scale for each in of]
+        if many:
+            axes.plot(places, heights, "o", markersize=4, label=run.record.method.label)
+        else:
+            around = [[(e.value - e.low) * scale for e in of], [(e.high - e.value) * scale for e in of]]
+            axes.bar(places, heights, width, yerr=around, capsize=2, label=run.record.method.label)
+    axes.set_xticks(range(len(names)), names, rotation=90 if many else 30, fontsize=6 if many else 8)
+    _finish(figure, axes, runs[0], "")
+    return figure
+
+
+def _top_curves(runs: Sequence[StoredRun]) -> Figure:
+    """The mean of the best k policies: on the episodes that selected them, and on other ones."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    metric = _headline(runs[0])
+    scale = 100 if metric.unit == "%" else 1
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    for run in runs:
+        same, others = views.top_curve(run.episodes, run.record.protocol)
+        counts = range(1, len(same) + 1)
+        (line,) = axes.plot(counts, same * scale, label=run.record.method.label)
+        axes.plot(counts, others * scale, "--", color=line.get_color())
+    _finish(
+        figure, axes, runs[0], "best k policies; dashed: selected on half of the episodes, scored on the other half"
+    )
+    return figure
+
+
+def _finish(figure: Figure, axes: Any, run: StoredRun, below: str) -> None:
+    protocol, metric = run.record.protocol, _headline(run)
+    axes.set_title(f"{protocol.task}, {protocol.split}")
+    axes.set_ylabel(f"{metric.label}{', %' if metric.unit else ''}")
+    axes.set_xlabel(below)
+    if metric.unit == "%":
+        axes.set_ylim(0, 103)
+    figure.legend(fontsize=8, loc="outside right upper")
+
+
+def _write(path: Path, content: str) -> None:
+    def write(temporary: Path) -> None:
+        temporary.write_text(content)
+
+    write_atomically(path, write)
+
+
+def _saver(figure: Figure) -> Callable[[Path], None]:
+    def save(temporary: Path) -> None:
+        figure.savefig(temporary, format="png", dpi=150, metadata={"Software": None})  # the same bytes every time
+
+    return save

@@ -1,0 +1,89 @@
+"""Stored runs: found in folders of results, read without torch."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated
+
+import pyarrow as pa
+from cyclopts import Parameter
+
+from nnit_bench.protocol import policies_per_architecture
+from nnit_bench.records import RECORD, RunRecord, read_episodes
+from nnit_zoo.errors import UserError, unknown_name
+
+FOLDERS = (Path("results"), Path("leaderboard/results"))
+"""Where runs are looked for: this machine's, and those that ship with the project."""
+Folders = Annotated[
+    tuple[Path, ...], Parameter(name="--results", show_default=lambda paths: ", ".join(map(str, paths)))
+]
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A finished run in its folder."""
+
+    record: RunRecord
+    folder: Path
+
+    @cached_property
+    def episodes(self) -> pa.Table:
+        """The run's episodes; raises UserError if they are missing or damaged."""
+        return read_episodes(self.folder)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is of the split as the benchmark defines it, with all its policies."""
+        protocol = self.record.protocol
+        return protocol.policies == policies_per_architecture(protocol.split)
+
+
+def find(folders: Iterable[Path]) -> list[StoredRun]:
+    """The finished runs below some folders, oldest first; a record that cannot be read is left out with a warning."""
+    found = []
+    for path in sorted({each.resolve() for folder in folders for each in folder.rglob(RECORD)}):
+        try:
+            record = RunRecord.read(path.parent)
+        except UserError as error:
+            sys.stderr.write(f"warning: left out: {error}\n")
+            continue
+        if record.status in ("success", "unsupported"):
+            found.append(StoredRun(record, path.parent))
+    return sorted(found, key=lambda run: (run.record.started, str(run.folder)))
+
+
+def latest(runs: Iterable[StoredRun]) -> dict[tuple[str, str, str], StoredRun]:
+    """(task, split, method) -> the newest of its runs, one that is whole before one that is not."""
+    ranked = sorted(runs, key=lambda run: (run.is_whole, run.record.started))
+    return {(run.record.protocol.task, run.record.protocol.split, run.record.method.name): run for run in ranked}
+
+
+def resolve(name: str, runs: Sequence[StoredRun], task: str, split: str) -> StoredRun:
+    """The run in the folder `name`, or the latest one of the method `name`.
+
+    Raises UserError, with the command that makes it, if there is none.
+    """
+    if (Path(name) / RECORD).is_file():
+        record = RunRecord.read(Path(name))
+        if record.status != "success":
+            raise UserError(f"the run in {name} has no results: it is '{record.status}'")
+        return StoredRun(record, Path(name))
+    mine = [run for run in runs if run.record.method.name == name and run.record.status == "success"]
+    found = latest(mine).get((task, split, name))
+    if found is None:
+        methods = {run.record.method.name for run in runs}
+        if name not in methods and "/" not in name and ":" not in name:
+            raise UserError(
+                f"{unknown_name('stored method', name, methods)}; make it with: {command(name, task, split)}"
+            )
+        raise UserError(f"no stored run of {name} on {task}, {split}; make one with: {command(name, task, split)}")
+    return found
+
+
+def command(method: str, task: str, split: str) -> str:
+    """The command that makes the run of a method."""
+    return f"nnit-bench run --method {method} --task {task} --split {split}"

@@ -1,0 +1,83 @@
+"""Two methods are told apart if they differ, and not if they do not."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nnit_bench import compare
+from nnit_bench.protocol import Episodes, Protocol
+from nnit_bench.results import StoredRun
+from nnit_zoo.errors import UserError
+
+
+@pytest.fixture
+def protocol(task: Any) -> Protocol:
+    return Protocol.of(task, "unseen", selection="paper", episodes=20)
+
+
+Store = Callable[..., StoredRun]
+
+
+def outcomes(shift: float, seed: int, columns: int = 20) -> np.ndarray:
+    """Successes that share hard architectures and hard episodes with those of any other seed."""
+    shared, own = np.random.default_rng(0), np.random.default_rng(seed)
+    hard = np.repeat(shared.normal(0, 1, 8), 10)[:, None] + shared.normal(0, 1, columns)
+    return np.asarray(shift + hard + own.normal(size=(80, columns)) > 0)
+
+
+def test_a_difference_is_seen_through_what_both_share(store: Store, protocol: Protocol) -> None:
+    """The intervals of the two overlap widely; paired, the difference stands out."""
+    better = store("better", protocol, outcomes(0.5, 1))
+    worse = store("worse", protocol, outcomes(0.0, 2))
+    found = {each.statistic: each for each in compare.differ(better, worse) if each.metric == "success_at_end"}
+    mean = found["mean"]
+    assert mean.separable and mean.difference.low > 0
+    assert mean.difference.value == pytest.approx(mean.first - mean.second)
+    first, second = (run.record.results.estimates["success_at_end"]["mean"] for run in (better, worse))  # type: ignore[union-attr]
+    assert first.low < second.high
+    words = compare.in_words("better", "worse", mean, protocol.metrics[0])
+    assert words.startswith("better is above worse in mean success at end by") and words.endswith("separable.")
+
+
+def test_no_difference_is_not_seen(store: Store, protocol: Protocol) -> None:
+    runs = [store(name, protocol, outcomes(0.2, seed)) for name, seed in (("one", 1), ("two", 2))]
+    mean = compare.differ(*runs)[0]
+    assert not mean.separable and mean.difference.low < 0 < mean.difference.high
+    assert "cannot be told apart" in compare.in_words("one", "two", mean, protocol.metrics[0])
+
+
+def test_a_run_against_itself_is_no_different_at_all(store: Store, protocol: Protocol) -> None:
+    run = store("one", protocol, outcomes(0.2, 1))
+    for each in compare.differ(run, run):
+        assert (each.difference.value, each.difference.low, each.difference.high) == (0, 0, 0)
+
+
+def test_only_shared_architectures_and_episodes_count(store: Store, protocol: Protocol) -> None:
+    everything = outcomes(0.2, 1)
+    whole = store("whole", protocol, everything)
+    later = protocol.model_copy(update={"select": Episodes(first=protocol.select.first + 5, count=15)})
+    part = store("part", later, everything[:40, 5:])
+    mean = compare.differ(whole, part)[0]
+    assert (mean.first, mean.second) == (everything[:40, 5:].mean(), everything[:40, 5:].mean())
+    assert mean.difference.value == 0
+    apart = protocol.model_copy(update={"select": Episodes(first=protocol.select.first + 50, count=20)})
+    with pytest.raises(UserError, match="no episode in common"):
+        compare.differ(whole, store("apart", apart, everything))
+
+
+def test_policies_of_a_generator_that_chooses_are_not_paired(store: Store, protocol: Protocol) -> None:
+    joint = protocol.model_copy(update={"split": "joint", "policies": {"any": 80}})
+    better = store("better", joint, outcomes(1.5, 1))
+    worse = store("worse", joint, outcomes(0.0, 2)[:70])
+    mean = compare.differ(better, worse)[0]
+    assert mean.separable and mean.difference.value == pytest.approx(mean.first - mean.second)
+
+
+@pytest.mark.parametrize("change", [{"task_version": 2}, {"split": "seen"}, {"simulator": "stock"}])
+def test_what_was_not_measured_alike_is_not_compared(store: Store, protocol: Protocol, change: dict[str, Any]) -> None:
+    one = store("one", protocol, outcomes(0.2, 1))
+    other = store("other", protocol.model_copy(update=change), outcomes(0.2, 1))
+    with pytest.raises(UserError, match="not measured alike"):
+        compare.differ(one, other)

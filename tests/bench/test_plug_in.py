@@ -1,0 +1,90 @@
+"""Plug-ins: the worked example in the docs, and a package installed from `tests/plugin_package`."""
+
+import re
+import shlex
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import nnit_bench.cli
+from nnit_baselines import generator
+from nnit_bench.check import examine, synthetic_view
+from nnit_zoo.errors import UserError
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "tests" / "plugin_package"
+TEXT = (ROOT / "docs" / "plug-in.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """The package, installed by pip into a folder of its own, and beside it one that fails to load."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*command, "--target", tmp_path, PACKAGE], check=True, capture_output=True)
+    broken = tmp_path / "broken-1.0.dist-info"
+    broken.mkdir()
+    (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (broken / "entry_points.txt").write_text(
+        "[nnit.generators]\nbroken = broken_plugin:Method\ncrop = elsewhere:Crop\n"
+    )
+    (tmp_path / "broken_plugin.py").write_text("raise ValueError('half-written')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    for name in ("nnit_gaussian", "broken_plugin"):
+        sys.modules.pop(name, None)
+
+
+def test_the_example_in_the_docs_is_short_and_keeps_the_contract(tmp_path):
+    (example,) = blocks("python")
+    assert len(example.splitlines()) < 60
+    path = tmp_path / "my_method.py"
+    path.write_text(example)
+    assert [verdict.problem for verdict in examine(generator.get(f"{path}:Gaussian")) if verdict.problem] == []
+
+
+def test_the_example_is_the_package_that_is_installed_here():
+    assert blocks("python") == [(PACKAGE / "nnit_gaussian" / "__init__.py").read_text()]
+    assert blocks("toml")[0] in (PACKAGE / "pyproject.toml").read_text()
+
+
+@pytest.mark.parametrize("command", [line for block in blocks("sh") for line in block.splitlines()])
+def test_shell_command_parses(command):
+    program, *arguments = shlex.split(command)
+    assert program == "nnit-bench"
+    nnit_bench.cli.app.parse_args(arguments, exit_on_error=False, print_error=False)
+
+
+def test_an_installed_package_offers_its_method_by_name(installed):
+    assert "gaussian" in generator.names()
+    kind = generator.get("gaussian")
+    assert Path(sys.modules[kind.__module__].__file__).is_relative_to(installed)
+    made = kind()
+    made.fit(synthetic_view())
+    made.save_pretrained(installed / "checkpoint")
+    assert kind.from_pretrained(installed / "checkpoint").task == made.task
+    with pytest.raises(UserError, match="did you mean gaussian"):
+        generator.get("gausian")
+
+
+def test_a_broken_package_warns_and_stops_no_other(installed):
+    with pytest.warns(UserWarning, match="method broken is left out: .*ValueError: half-written") as caught:
+        available = generator.available()
+    assert (
+        len(caught) == 1 and {"gaussian", "nnit", *generator.BUILT_IN} <= set(available) and "broken" not in available
+    )
+    assert available["crop"].__module__ == "nnit_baselines.controls.resized"  # the built-in one keeps its name
+    with pytest.raises(UserError, match="cannot load method"):
+        generator.get("broken")
+
+
+def test_without_the_package_there_is_no_such_method():
+    assert "nnit-gaussian" not in {each.metadata["Name"] for each in metadata.distributions()}
+    with pytest.raises(UserError, match="no method named 'gaussian'"):
+        generator.get("gaussian")

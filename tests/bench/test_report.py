@@ -1,0 +1,142 @@
+"""Stored runs become tables, figures and rows beside the paper's."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nnit_bench import paper, results
+from nnit_bench.protocol import Metric, Protocol
+from nnit_bench.report import report
+from nnit_bench.results import StoredRun
+from nnit_zoo.errors import UserError
+
+Store = Callable[..., StoredRun]
+
+
+def outcomes(level: float, policies: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((policies, 10)) < level
+
+
+@pytest.fixture
+def pick(task: Any) -> Protocol:
+    """A protocol like PickCube's."""
+    return Protocol.of(task, "unseen", selection="paper", episodes=10).model_copy(update={"task": "PickCube-v1"})
+
+
+def joint_of(protocol: Protocol) -> Protocol:
+    return protocol.model_copy(update={"split": "joint", "policies": {"any": 100}})
+
+
+def test_a_damaged_record_stops_nothing(store: Store, pick: Protocol, capsys: pytest.CaptureFixture[str]) -> None:
+    good = store("nnit", pick, outcomes(0.9, 80))
+    bad = store("crop", pick, outcomes(0.9, 80))
+    (bad.folder / "run.json").write_text("{")
+    root = good.folder.parents[3]
+    assert [run.record.method.name for run in results.find([root, root / "nowhere"])] == ["nnit"]
+    assert "warning: left out: " in capsys.readouterr().err
+
+
+def test_the_newest_whole_run_is_taken(store: Store, pick: Protocol) -> None:
+    old, new = (store("nnit", pick.model_copy(update={"seed": seed}), outcomes(0.9, 80)) for seed in (0, 1))
+    part = pick.model_copy(update={"policies": {"16-16-16-32": 10}})
+    part_of_it = store("nnit", part, outcomes(0.9, 10))
+    found = results.find([old.folder.parents[3]])
+    assert len(found) == 3 and not part_of_it.is_whole
+    assert results.resolve("nnit", found, "PickCube-v1", "unseen").record.run_id == new.record.run_id
+    by_folder = results.resolve(str(part_of_it.folder), found, "", "")
+    assert by_folder.record.run_id == part_of_it.record.run_id
+
+
+def test_a_missing_run_is_answered_with_its_command(store: Store, pick: Protocol) -> None:
+    found = [store("nnit", pick, outcomes(0.9, 80))]
+    with pytest.raises(UserError, match=r"run of nnit on PushCube-v1, seen; .* nnit --task PushCube-v1 --split seen"):
+        results.resolve("nnit", found, "PushCube-v1", "seen")
+    with pytest.raises(UserError, match=r"no stored method named 'nit': did you mean nnit\?; make it with: nnit-bench"):
+        results.resolve("nit", found, "PickCube-v1", "unseen")
+
+
+def test_report_has_every_method_and_its_figures(
+    store: Store, pick: Protocol, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store("nnit", pick, outcomes(0.9, 80))
+    store("crop", pick, outcomes(0.9, 80, seed=1))
+    store("random", pick, outcomes(0.1, 80))
+    store("nnit", joint_of(pick), outcomes(0.9, 100))
+    output = tmp_path / "report"
+    report(folders=(tmp_path,), output=output, as_json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert json.loads((output / "report.json").read_text()) == printed and len(printed) == 4
+
+    lines = (output / "report.md").read_text().splitlines()
+    of_unseen = lines[: lines.index("## PickCube-v1, joint")]
+    rows = [line for line in of_unseen if line.startswith(("| nnit", "| crop", "| random"))]
+    assert ["tied" in row for row in rows] == [False, True, False]
+    assert rows[2].startswith("| random") and rows[2].endswith("| 2.0% (0.02) |")
+    assert any(line.startswith("| NNiT, unseen | paper | 38.70 ±0.36 | 99") for line in lines)
+
+    values = list(csv.DictReader((output / "report.csv").open()))
+    means = [row for row in values if row["statistic"] == "mean" and not row["architecture"]]
+    assert len(means) == 4 * 3
+    found = results.latest(results.find([tmp_path]))["PickCube-v1", "unseen", "random"].record.results
+    assert found is not None
+    (mine,) = (row for row in means if row["method"] == "random" and row["metric"] == "success_at_end")
+    assert float(mine["low"]) == found.estimates["success_at_end"]["mean"].low
+
+    for name in ("architectures-PickCube-v1-unseen", "top-PickCube-v1-unseen", "top-PickCube-v1-joint"):
+        assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert not (output / "architectures-PickCube-v1-joint.png").exists()
+    before = {path.name: path.read_bytes() for path in output.iterdir()}
+    report(folders=(tmp_path,), output=output)
+    assert {path.name: path.read_bytes() for path in output.iterdir()} == before
+
+
+def test_nothing_to_report_is_answered(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="make one with: nnit-bench run"):
+        report(folders=(tmp_path,), output=tmp_path / "report")
+
+
+def test_our_row_stands_under_the_papers(store: Store, pick: Protocol, capsys: pytest.CaptureFixture[str]) -> None:
+    run = store("nnit", pick, outcomes(0.9, 80))
+    folders = (run.folder.parents[3],)
+    (table,) = paper.main_table(results.latest(results.find(folders)))
+    rows = {row.label: row.cells for row in table.rows if row.source == "here"}
+    assert run.record.results is not None
+    top = run.record.results.estimates["success_at_end"]["top"]
+    assert rows["NNiT, unseen"][1] == paper.Number.of(top, 100)
+    assert rows["NNiT, seen"] == (None,) * 6
+    assert "missing: nnit-bench run --method nnit --task PickCube-v1 --split seen" in table.missing
+    assert "missing: SANE is not in this version of nnit" in table.missing
+
+    (full,) = paper.full_distribution(results.latest(results.find(folders)))
+    worst = run.record.results.estimates["success_at_end"]["worst"]
+    cells = {row.label: row.cells for row in full.rows if row.source == "here"}
+    assert cells["worst arch., NNiT"][0] == paper.Number.of(worst, 100)
+
+    paper.reproduce(table="main", folders=folders)
+    out = capsys.readouterr().out
+    assert max(len(line) for line in out.splitlines() if not line.startswith("missing")) <= 80
+    paper.reproduce(table="full-distribution", folders=folders, as_json=True)
+    assert json.loads(capsys.readouterr().out)[0]["rows"][0]["cells"][0]["value"] == 78.8
+
+
+def test_what_the_generator_chose_stands_beside_the_papers(store: Store, pick: Protocol) -> None:
+    run = store("nnit", joint_of(pick), outcomes(0.9, 100))
+    scores, chosen = paper.joint(results.latest([run]))
+    assert scores.rows[1].cells[0] is not None
+    assert [cell and cell.value for cell in chosen.rows[1].cells] == [1, 1, 100, 1]
+
+
+def test_networks_above_80_percent_are_counted(store: Store, digits: Any) -> None:
+    accuracy = (Metric(column="return", label="accuracy", unit="%"),)
+    protocol = Protocol.of(digits, "unseen").model_copy(update={"task": "MNIST-PCA32", "metrics": accuracy})
+    values = np.full((80, 8), 0.95)
+    values[:3] = 0.7
+    (table,) = paper.mnist(results.latest([store("nnit", protocol, values)]))
+    mean, above = table.rows[1].cells
+    assert mean is not None and mean.value == pytest.approx(100 * values.mean(), rel=1e-6)
+    assert above is not None and above.value == 77
