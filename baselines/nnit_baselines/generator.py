@@ -7,12 +7,13 @@ import importlib.util
 import json
 import sys
 import tempfile
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import safetensors.torch
 from huggingface_hub import HfApi, snapshot_download
@@ -21,15 +22,22 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.build.files import write_atomically, write_json
+from nnit_zoo.atomic import write_atomically, write_json
 from nnit_zoo.errors import UserError, unknown_name
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView, Zoo
 
 BUILT_IN = {
     "nnit": "nnit_baselines.nnit.generator:NNiT",
-    "crop": "nnit_baselines.controls.crop:Crop",
-    "ghn-oracle": "nnit_baselines.controls.ghn_oracle:GHNOracle",
+    "ghn-oracle": "nnit_baselines.controls.stored:GHNOracle",
+    "zoo": "nnit_baselines.controls.stored:Stored",
+    "noise-0.03": "nnit_baselines.controls.stored:Noise003",
+    "noise-0.06": "nnit_baselines.controls.stored:Noise006",
+    "noise-0.1": "nnit_baselines.controls.stored:Noise01",
+    "mean": "nnit_baselines.controls.stored:Mean",
+    "crop": "nnit_baselines.controls.resized:Crop",
+    "nearest": "nnit_baselines.controls.resized:Nearest",
+    "random": "nnit_baselines.controls.initial:Random",
 }
 ENTRY_POINTS = "nnit.generators"
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
@@ -40,9 +48,9 @@ METADATA = {"format": "pt"}
 
 @dataclass(frozen=True)
 class SampleRequest:
-    """Wanted: `policies` networks of `architecture` (None = joint: the generator chooses), drawn with `seed`."""
+    """Wanted: `policies` networks of `architecture`, drawn with `seed`."""
 
-    architecture: Architecture | None
+    architecture: Architecture
     policies: int
     seed: int
 
@@ -54,7 +62,13 @@ class Capabilities:
     conditional: bool = True
     """Samples networks of a requested architecture."""
     joint: bool = False
-    """Samples architecture and weights together."""
+    """Samples architecture and weights together (NNiT 6.5)."""
+    widths: tuple[int, ...] | None = None
+    """The hidden widths that it can make; None = any."""
+    depths: tuple[int, ...] | None = None
+    """The numbers of hidden layers that it can make; None = any."""
+    deterministic: bool = False
+    """Has only one network per architecture, whatever the seed."""
     checkpoint: bool = True
     """Is trained beforehand and read from a checkpoint; otherwise `fit` takes no time and is called at every run."""
     oracle: bool = False
@@ -78,10 +92,11 @@ class Generator(ABC):
     """A source of networks for one task: `fit` on a zoo's view, then `sample`.
 
     It is made without arguments. A subclass with a checkpoint also says what to store (`config`, `tensors`) and how to
-    come back (`from_state`).
+    come back (`from_state`). `nnit-bench check` tells whether one keeps to what is written here.
     """
 
-    capabilities: ClassVar[Capabilities]
+    capabilities: Capabilities
+    """Set by the class; a fitted generator may narrow its own."""
 
     def __init__(self) -> None:
         self.task = ""
@@ -89,16 +104,38 @@ class Generator(ABC):
         self.training: dict[str, Any] = {}
         """Facts about the training, kept in config.json."""
 
+    @classmethod
+    def from_preset(cls, name: str) -> Self:
+        """A generator with the named settings, not yet fitted; raises UserError if there are none of that name."""
+        raise UserError(f"{cls.__name__} has no presets, so none named '{name}'")
+
     @abstractmethod
     def fit(self, view: TrainingView, run: Run | None = None) -> None:
         """Learn from the policies of a view; raises UserError for a reference view unless this is an oracle."""
 
+    def supports(self, architecture: Architecture) -> bool:
+        """Whether `sample` can make networks of this architecture, once fitted; by default, as declared."""
+        able, hidden = self.capabilities, architecture.hidden
+        return (
+            able.conditional
+            and (able.depths is None or len(hidden) in able.depths)
+            and (able.widths is None or set(hidden) <= set(able.widths))
+        )
+
     @abstractmethod
     def sample(self, request: SampleRequest) -> PolicyBatch:
-        """The requested networks, float32; the same request gives the same networks.
+        """The requested networks, float32: the same for the same request, whatever was asked before.
 
-        Raises UserError if this generator cannot make that architecture.
+        Raises UserError if this generator does not support that architecture.
         """
+
+    def sample_joint(self, policies: int, seed: int) -> list[PolicyBatch]:
+        """`policies` networks of architectures that the generator chooses, float32; the same for the same arguments.
+
+        One batch for each architecture chosen, in the order of the architectures. Raises UserError if this generator
+        does not choose architectures.
+        """
+        raise UserError(f"{type(self).__name__} does not choose architectures: request one")
 
     def config(self) -> dict[str, Any]:
         """What config.json holds besides method, task and training: plain JSON values."""
@@ -161,6 +198,17 @@ def names() -> tuple[str, ...]:
     return tuple(sorted({*BUILT_IN, *entry_points(group=ENTRY_POINTS).names}))
 
 
+def available() -> dict[str, type[Generator]]:
+    """The classes of all names; an installed plug-in that cannot be loaded is left out with a warning."""
+    found = {}
+    for name in names():
+        try:
+            found[name] = get(name)
+        except UserError as error:
+            warnings.warn(f"method {name} is left out: {error}", stacklevel=2)
+    return found
+
+
 def get(name: str) -> type[Generator]:
     """The generator class with this name, or at `package.module:Class` or `path/to/file.py:Class`.
 
@@ -207,8 +255,10 @@ def _load(address: str) -> type[Generator]:
     place, _, attribute = address.rpartition(":")
     try:
         module = _run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
-    except (ImportError, OSError, SyntaxError) as error:
-        raise UserError(f"cannot load method '{address}': {error}") from None
+    except UserError:
+        raise
+    except Exception as error:  # somebody else's code, which may fail in any way
+        raise UserError(f"cannot load method '{address}': {type(error).__name__}: {error}") from error
     found = getattr(module, attribute, None)
     if found is None:
         raise unknown_name(f"class in {place}", attribute, [name for name in vars(module) if name[0].isupper()])

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import platform
-import subprocess
 from pathlib import Path
 
 import torch
 
 import nnit_zoo
 from nnit_baselines.generator import Generator, Run, get
-from nnit_zoo.build.files import write_atomically
+from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import MANIFEST, sha256_of
+from nnit_zoo.provenance import commit
 
 CARD = """---
 license: apache-2.0
@@ -40,23 +40,25 @@ policies = generator.sample(SampleRequest(Architecture.parse("16-64-64-32", {inp
 """
 
 
-def train(method: str, task: str, run: Run, output: Path, zoo_folder: Path | None = None) -> Generator:
+def train(
+    method: str, task: str, run: Run, output: Path, zoo_folder: Path | None = None, preset: str | None = None
+) -> Generator:
     """Fit `method` on the task's training view and write config.json, model.safetensors and README.md to `output`.
 
-    An interrupted run goes on from `run.folder`. Raises UserError for an unknown method, one that needs no training,
-    or a missing zoo.
+    An interrupted run goes on from `run.folder`. Raises UserError for an unknown method or preset, a method that needs
+    no training, or a missing zoo.
     """
     kind = get(method)
     if not kind.capabilities.checkpoint:
         raise UserError(f"{method} needs no training; run: nnit-bench run --method {method}")
     zoo = nnit_zoo.load(task, zoo_folder)
     view = zoo.training_view()
-    generator = kind()
+    generator = kind() if preset is None else kind.from_preset(preset)
     generator.fit(view, run)
     generator.training |= {
         "policies": len(view),
         "zoo_manifest_sha256": sha256_of(zoo.folder / MANIFEST),
-        "git_commit": git_commit(),
+        "git_commit": str(commit()),
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
     }
@@ -76,12 +78,3 @@ def card(method: str, generator: Generator, inputs: int, outputs: int) -> str:
     facts = "\n".join(f"| {name.replace('_', ' ')} | {value} |" for name, value in generator.training.items())
     name = type(generator).__name__
     return CARD.format(name=name, method=method, task=generator.task, inputs=inputs, outputs=outputs, facts=facts)
-
-
-def git_commit() -> str:
-    """The commit of the code that runs, `-dirty` if it was changed since; `unknown` outside a repository."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--match="]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603 - fixed
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"

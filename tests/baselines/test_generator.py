@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from nnit_baselines import generator as generators
-from nnit_baselines.controls.crop import Crop
+from nnit_baselines.controls.resized import Crop
 from nnit_zoo.errors import UserError
 
 PLUGIN = """
@@ -55,9 +55,9 @@ def test_built_in_names_lead_to_classes():
 
 
 def test_listing_names_imports_no_method():
-    sys.modules.pop("nnit_baselines.controls.ghn_oracle", None)
+    sys.modules.pop("nnit_baselines.controls.stored", None)
     generators.names()
-    assert "nnit_baselines.controls.ghn_oracle" not in sys.modules
+    assert "nnit_baselines.controls.stored" not in sys.modules
 
 
 def test_a_class_in_a_file_or_a_module_is_a_method(plugin, monkeypatch):

@@ -3,50 +3,35 @@
 from __future__ import annotations
 
 import json
+import math
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from nnit_baselines import diffusion
 from nnit_baselines.generator import Run
-from nnit_baselines.nnit.config import NNiTConfig
+from nnit_baselines.nnit.mixture import Mixture, Packed
 from nnit_baselines.nnit.model import Transformer
-from nnit_zoo.build.files import write_atomically
+from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
 
 SAVE_SECONDS = 120.0
 LOG_STEPS = 50
+QUALITY_STEPS = 1000
 STATE = "state.pt"
 LOG = "log.jsonl"
-
-
-@dataclass(frozen=True)
-class Packed:
-    """All policies of one architecture as patches, with what the transformer needs to know of them."""
-
-    patches: Tensor
-    """[policies, L, p p], standardised."""
-    mask: Tensor
-    """[L, p p], whether an entry is a parameter."""
-    positions: Tensor
-    """[L, 3]."""
-    widths: Tensor
-    """[S]."""
 
 
 class Trainer:
     """A model in training: the optimiser, the running mean of its weights, and how far it is."""
 
-    def __init__(self, model: Transformer, data: list[Packed], settings: NNiTConfig, seed: int) -> None:
+    def __init__(self, model: Transformer, data: list[Packed], mixture: Mixture, seed: int) -> None:
         self.model = model
         self.data = data
-        self.settings = settings
+        self.mixture = mixture
+        self.settings = settings = mixture.settings
         self.seed = seed
         self.step = 0
         self.seconds = 0.0
@@ -56,17 +41,11 @@ class Trainer:
 
     def advance(self) -> float:
         """One optimiser step; returns the loss."""
-        packed, chosen, generator = self.draw()
-        clean = packed.patches[chosen]
-        settings = self.settings
-        level = diffusion.noise_levels(len(clean), settings.level_mean, settings.level_std, generator)
-        noise = torch.randn(clean.shape, generator=generator) * packed.mask
-        noisy = diffusion.interpolate(clean, noise, level)
-        estimate = self.model(noisy, level, packed.positions, packed.widths)
-        loss = diffusion.loss(estimate, clean, level, packed.mask, settings.level_floor)
+        self.model.train()
+        loss = self.mixture.loss(self.model, self.data, self.step, self.seed)
         self.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip)
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.settings.clip)
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate()
         self.optimiser.step()
@@ -74,25 +53,30 @@ class Trainer:
         self.step += 1
         return loss.item()
 
-    def draw(self) -> tuple[Packed, Tensor, torch.Generator]:
-        """The architecture and policies of this step, and the generator for its noise.
-
-        A function of the seed and the step alone, so that a resumed training draws the same. Architectures come in a
-        new random order each round; a batch repeats no policy before it has all of the architecture.
-        """
-        round_, turn = divmod(self.step, len(self.data))
-        packed = self.data[int(np.random.default_rng([self.seed, 0, round_]).permutation(len(self.data))[turn])]
-        generator = torch.Generator()
-        generator.manual_seed(int(np.random.SeedSequence([self.seed, 1, self.step]).generate_state(1)[0]))
-        stored, wanted = len(packed.patches), self.settings.batch
-        orders = [torch.randperm(stored, generator=generator) for _ in range(-(-wanted // stored))]
-        return packed, torch.cat(orders)[:wanted], generator
-
     def rate(self) -> float:
         """The learning rate of this step."""
         settings = self.settings
         rise = min(1.0, (self.step + 1) / settings.warmup)
-        return settings.learning_rate * rise * (1 - self.step / settings.steps)
+        left = 1 - self.step / settings.steps
+        if settings.decay == "cosine":
+            left = 0.5 - 0.5 * math.cos(math.pi * left)
+        last = settings.last_learning_rate
+        return rise * (last + (settings.learning_rate - last) * left)
+
+    def quality(self) -> float:
+        """How far samples are from the nearest stored policy: the median of |difference| / |policy|, standardised.
+
+        Of four samples of each of three architectures that are learned from; no others have a say in training.
+        """
+        model, distances = self.mean.module.eval(), []
+        for packed in self.data[:: -(-len(self.data) // 3)]:
+            generator = torch.Generator().manual_seed(self.seed)
+            with torch.inference_mode():
+                made = self.mixture.sample(model, packed.architecture, 4, generator) * packed.where.mask
+            stored = packed.patches.flatten(1)
+            nearest = torch.cdist(made.flatten(1), stored).min(dim=1)
+            distances.append(nearest.values / stored[nearest.indices].norm(dim=1))
+        return float(torch.cat(distances).median())
 
     def identity(self) -> str:
         """What must agree between a state and a training that goes on from it."""
@@ -119,9 +103,9 @@ class Trainer:
         self.step, self.seconds = state["step"], state["seconds"]
 
 
-def train(model: Transformer, data: list[Packed], settings: NNiTConfig, run: Run) -> dict[str, Any]:
+def train(model: Transformer, data: list[Packed], mixture: Mixture, run: Run) -> dict[str, Any]:
     """Train `model` in place, to the running mean of its weights; returns the facts for config.json."""
-    trainer = Trainer(model, data, settings, run.seed)
+    trainer, settings = Trainer(model, data, mixture, run.seed), mixture.settings
     log = Log(run.folder)
     if run.folder is not None:
         run.folder.mkdir(parents=True, exist_ok=True)
@@ -148,7 +132,10 @@ def train(model: Transformer, data: list[Packed], settings: NNiTConfig, run: Run
 
 
 class Log:
-    """One JSON line every LOG_STEPS steps: step, mean loss, learning rate, seconds, policies per second."""
+    """One JSON line every LOG_STEPS steps: step, mean loss, learning rate, seconds, policies per second.
+
+    Every QUALITY_STEPS steps, and at the end, also the quality of samples of architectures that are learned from.
+    """
 
     def __init__(self, folder: Path | None) -> None:
         self.path = folder / LOG if folder is not None else None
@@ -176,5 +163,7 @@ class Log:
             "seconds": round(trainer.seconds, 1),
             "policies_per_second": round(trainer.step * trainer.settings.batch / trainer.seconds, 1),
         }
+        if trainer.step % QUALITY_STEPS == 0 or trainer.step == trainer.settings.steps:
+            line["quality"] = trainer.quality()
         with self.path.open("a") as file:
             file.write(json.dumps(line) + "\n")
