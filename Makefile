@@ -6,13 +6,14 @@ READY := $(BIN)/.ready
 # One thread per process: the work is spread over processes, and idle OpenMP threads spin.
 export OMP_NUM_THREADS := 1
 
-.PHONY: help bench test test-slow lint render-setup
+.PHONY: help bench test test-slow lint docs render-setup
 
 help:
 	@echo 'make bench         score NNiT on PickCube-v1, unseen architectures, and print the table'
 	@echo 'make test          lint, types and tests'
 	@echo 'make test-slow     the tests that take minutes'
 	@echo 'make lint          ruff and mypy only'
+	@echo 'make docs          the documentation, as HTML in docs/_build'
 	@echo 'make render-setup  fetch what nnit-bench render needs on a machine without a GPU (Debian)'
 
 bench: $(READY)
@@ -28,6 +29,9 @@ lint: $(READY)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+
+docs: $(READY)
+	@$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build
 
 render-setup:
 	@sh nnit_zoo/sim/lavapipe.sh

@@ -89,7 +89,7 @@ class Protocol(BaseModel):
     """The task's scores; the policies are ranked by the first, ties by the last."""
     split: str
     policies: dict[str, int]
-    """How many policies are generated for each architecture, in the order of the split; `{"any": n}` on `joint`."""
+    """How many policies are generated for each architecture, in the order of the split; on `joint` of "any"."""
     selection: Selection = "heldout"
     """Episodes that score the selected: `paper`, those that selected them; `heldout`, others as well."""
     top: int = 10

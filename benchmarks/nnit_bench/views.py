@@ -6,8 +6,8 @@ them, as in the paper; `top_heldout` is their mean on others.
 What an interval allows for depends on the sentence that the number stands for. `mean` speaks of the generator on
 architectures like these: architectures, with their policies, are drawn (the committed 8 stand for others), and so are
 episodes; on `joint` the generator draws the architectures itself, so policies are drawn. `worst` speaks of one
-architecture, the one that came out lowest: policies and episodes are drawn. The two `top`s speak of these ten policies:
-only episodes are drawn. How well the worst or the best were picked is in no interval.
+architecture, the one that came out lowest: policies and episodes are drawn. Both kinds of `top` speak of these ten
+policies: only episodes are drawn. How well the worst or the best were picked is in no interval.
 """
 
 from __future__ import annotations

@@ -36,11 +36,11 @@ class MNISTConfig(FitConfig):
     """
 
     steps: int = 3000
-    learning_rate: float = 8e-3
-    weight_decay: float = 0.3
+    learning_rate: float = 1e-2
+    weight_decay: float = 0.25
     architectures_per_step: int = 2
     states_per_architecture: int = 2048
-    weight_noise: float = 0.03
+    weight_noise: float = 0.02
 
 
 def read_digits(source: str) -> dict[str, tuple[Bytes, Bytes]]:

@@ -99,7 +99,7 @@ class Transformer(nn.Module):
         elif len(self.patch_out) == 1:
             output = weights @ self.patch_out[0]
         else:
-            output = torch.einsum("nld,ldp->nlp", weights, self.patch_out[cell])
+            output = torch.einsum("nld,ldp->nlp", weights, self.patch_out.index_select(0, cell))
         widths = None if self.widths_out is None else self._channels(self.widths_out(architecture))
         return widths, self._channels(output)
 

@@ -69,6 +69,7 @@ class Trainer:
         Of four samples of each of three architectures that are learned from; no others have a say in training.
         """
         model, distances = self.mean.module.eval(), []
+        assert isinstance(model, Transformer)
         for packed in self.data[:: -(-len(self.data) // 3)]:
             generator = torch.Generator().manual_seed(self.seed)
             with torch.inference_mode():
