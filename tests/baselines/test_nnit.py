@@ -13,12 +13,12 @@ from nnit_baselines.nnit import training
 from nnit_baselines.nnit.config import PRESETS, NNiTConfig, preset
 from nnit_baselines.nnit.form import Form
 from nnit_baselines.nnit.generator import NNiT
-from nnit_baselines.nnit.mixture import PaddedMixture, Places
+from nnit_baselines.nnit.mixture import Places
 from nnit_baselines.nnit.model import Transformer
 from nnit_zoo.architecture import Architecture, architectures
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
-from nnit_zoo.views import canvas
+from nnit_zoo.views import canvas, patches
 from nnit_zoo.zoo import TrainingView
 
 SMALL = {"width": 32, "depth": 2, "heads": 2, "steps": 6, "batch": 4, "warmup": 2, "ema": 0.5, "sampling_steps": 3}
@@ -133,10 +133,8 @@ def test_places_of_patches_are_those_of_the_paper_s_grid():
     batch = gaussian_batch(ARCHITECTURE, 2)
     where = Places.of(ARCHITECTURE, FORM, PADDED)
     squares = canvas.pack(batch, 32).reshape(2, 3, 2, 16, 3, 16).transpose(3, 4).reshape(2, 18, 256)
-    assert squares[:, where.places[:, 0]].count_nonzero() == batch.flat().numel()
-    mixture = PaddedMixture(PADDED, FORM)
-    model = SimpleNamespace(cells=18)
-    assert mixture._places(model)[:, 0].tolist() == list(range(18))
+    assert torch.equal(squares[:, where.places[:, 0]], patches.pack(batch))
+    assert squares.count_nonzero() == batch.flat().count_nonzero()
 
 
 # Training

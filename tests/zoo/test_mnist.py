@@ -172,7 +172,7 @@ def test_there_are_100_blocks_and_one_test_set() -> None:
 
 
 def test_a_hundred_steps_teach_an_unseen_architecture_to_tell_digits_apart(tmp_path: Path) -> None:
-    config = mnist.MNISTConfig(steps=100, states_per_architecture=256)
+    config = mnist.MNISTConfig(steps=100, states_per_architecture=256, learning_rate=3e-3)
     mnist.train_ghn(config, tmp_path / "ghn.safetensors", seed=0)
     ghn = GHN.from_state(32, 10, load_state(tmp_path / "ghn.safetensors"))
     table = TASK.evaluate([stored(ghn, architectures("unseen", 32, 10)[0])], TASK.scoring_seeds)

@@ -1,0 +1,79 @@
+"""Checkpoints on the Hub, against the local stand-in that the zoo's tests use."""
+
+import hashlib
+import importlib.util
+import re
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+
+from nnit_baselines.generator import SampleRequest
+from nnit_baselines.nnit.config import NNiTConfig
+from nnit_baselines.nnit.generator import NNiT
+from nnit_zoo.errors import UserError
+
+spec = importlib.util.spec_from_file_location("zoo_conftest", Path(__file__).parents[1] / "zoo" / "conftest.py")
+stand_in = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(stand_in)
+
+
+class ModelHandler(stand_in.Handler):
+    """The stand-in's data sets, at the addresses that models have."""
+
+    def do_GET(self):
+        self.path = self.as_data_set()
+        if match := re.match("/api/datasets/(.+)/tree/", self.path):
+            files = self.server.files[match[1]].items()
+            self.answer(200, [{"type": "file", "path": name, "size": len(file), "oid": "0"} for name, file in files])
+        else:
+            super().do_GET()
+
+    do_HEAD = do_GET
+
+    def do_POST(self):
+        self.path = self.as_data_set()
+        super().do_POST()
+
+    def as_data_set(self):
+        path = re.sub("^/api/models/", "/api/datasets/", self.path)
+        return re.sub("^/([^/]+/[^/]+)/resolve/", r"/datasets/\1/resolve/", path)
+
+    def give_file(self, repository, name):
+        content = self.server.files[repository][name]
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("ETag", hashlib.sha256(content).hexdigest())
+        self.send_header("X-Repo-Commit", self.sha)
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(content)
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    server = stand_in.Hub()
+    server.RequestHandlerClass = ModelHandler
+    stand_in.point_at(server.address, monkeypatch)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    yield server
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_what_is_pushed_comes_back_the_same(hub, view):
+    generator = NNiT(NNiTConfig(width=16, depth=1, heads=1, batch=2, steps=1, sampling_steps=2))
+    generator.fit(view)
+    assert hub.address in generator.push_to_hub("someone/nnit")
+    assert set(hub.files["someone/nnit"]) == {"config.json", "model.safetensors"}
+    back, request = NNiT.from_pretrained("someone/nnit", view.task), SampleRequest(view.architectures[0], 2, 0)
+    assert torch.equal(back.sample(request).flat(), generator.sample(request).flat())
+
+
+def test_a_repository_that_is_not_there_gets_an_answer(hub):
+    with pytest.raises(UserError, match="'someone/else' is neither a folder nor a repository of the Hub"):
+        NNiT.from_pretrained("someone/else")
