@@ -21,8 +21,9 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 from safetensors import SafetensorError
 from torch import Tensor
 
+from nnit_baselines.card import card
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.atomic import write_atomically, write_json
+from nnit_zoo.atomic import write_atomically, write_bytes, write_json
 from nnit_zoo.errors import UserError, unknown_name
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView, Zoo
@@ -43,6 +44,7 @@ ENTRY_POINTS = "nnit.generators"
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
+CARD = "README.md"
 METADATA = {"format": "pt"}
 
 
@@ -86,6 +88,8 @@ class Run:
     """Where the state to resume from and the log are kept; None = nowhere."""
     progress: Callable[[int, int], None] | None = None
     """Called with the steps done and the steps in all."""
+    track: Callable[[dict[str, float]], None] | None = None
+    """Called with each line of the training's log: at least its `step`."""
 
 
 class Generator(ABC):
@@ -151,12 +155,14 @@ class Generator(ABC):
         raise UserError(f"{cls.__name__} keeps no checkpoint: it is made from the zoo at every run")
 
     def save_pretrained(self, folder: Path | str) -> None:
-        """Write config.json and model.safetensors, the Hub's convention, into `folder`."""
+        """Write config.json, model.safetensors and a model card, the Hub's convention, into `folder`."""
         folder = Path(folder)
         config = {"method": type(self).__name__, "task": self.task, **self.config(), "training": self.training}
         tensors = self.tensors()
         write_atomically(folder / WEIGHTS, lambda path: safetensors.torch.save_file(tensors, path, METADATA))
         write_json(folder / CONFIG, config)
+        text = card(type(self).__name__, _address(type(self)), self.task, self.training)
+        write_bytes(folder / CARD, text.encode())
 
     @classmethod
     def from_pretrained(cls, source: Path | str, task: str | None = None) -> Self:
@@ -265,6 +271,12 @@ def _load(address: str) -> type[Generator]:
     if not (isinstance(found, type) and issubclass(found, Generator)):
         raise UserError(f"'{address}' is not a subclass of nnit_baselines.generator.Generator")
     return found
+
+
+def _address(kind: type[Generator]) -> str:
+    """What `get` finds the class by: its name if it is built in."""
+    address = f"{kind.__module__}:{kind.__qualname__}"
+    return next((name for name, built_in in BUILT_IN.items() if built_in == address), address)
 
 
 def _run_file(path: Path) -> Any:

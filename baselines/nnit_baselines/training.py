@@ -9,35 +9,9 @@ import torch
 
 import nnit_zoo
 from nnit_baselines.generator import Generator, Run, get
-from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import MANIFEST, sha256_of
 from nnit_zoo.provenance import commit
-
-CARD = """---
-license: apache-2.0
-library_name: nnit
-tags:
-- weight-generation
-- {task}
----
-# {name} for {task}
-
-Generates the weights of small {task} policies for a requested architecture. Trained on the policies of seen
-architectures and training seeds of the `nnit` zoo.
-
-```python
-from nnit_baselines.generator import SampleRequest, get
-from nnit_zoo.architecture import Architecture
-
-generator = get("{method}").from_pretrained("FOLDER_OR_HUB_ID")
-policies = generator.sample(SampleRequest(Architecture.parse("16-64-64-32", {inputs}, {outputs}), policies=10, seed=0))
-```
-
-| Training | |
-|---|---|
-{facts}
-"""
 
 
 def train(
@@ -63,18 +37,4 @@ def train(
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
     }
     generator.save_pretrained(output)
-    shape = view.architectures[0]
-    text = card(method, generator, shape.inputs, shape.outputs)
-
-    def write(path: Path) -> None:
-        path.write_text(text)
-
-    write_atomically(output / "README.md", write)
     return generator
-
-
-def card(method: str, generator: Generator, inputs: int, outputs: int) -> str:
-    """The checkpoint's model card."""
-    facts = "\n".join(f"| {name.replace('_', ' ')} | {value} |" for name, value in generator.training.items())
-    name = type(generator).__name__
-    return CARD.format(name=name, method=method, task=generator.task, inputs=inputs, outputs=outputs, facts=facts)

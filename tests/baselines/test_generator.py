@@ -98,6 +98,8 @@ def test_a_checkpoint_comes_back_for_its_own_task_only(plugin, tmp_path):
     made.save_pretrained(tmp_path / "saved")
     back = kind.from_pretrained(tmp_path / "saved", "Push")
     assert (back.task, back.value, back.training) == ("Push", 2.5, {"steps": 3})
+    card = (tmp_path / "saved" / "README.md").read_text()
+    assert "# Constant for Push" in card and "| steps | 3 |" in card
     with pytest.raises(UserError, match="is for Push, not for Pick"):
         kind.from_pretrained(tmp_path / "saved", "Pick")
     with pytest.raises(UserError, match="is of Constant, not of NNiT"):

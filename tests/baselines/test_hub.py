@@ -69,7 +69,8 @@ def test_what_is_pushed_comes_back_the_same(hub, view):
     generator = NNiT(NNiTConfig(width=16, depth=1, heads=1, batch=2, steps=1, sampling_steps=2))
     generator.fit(view)
     assert hub.address in generator.push_to_hub("someone/nnit")
-    assert set(hub.files["someone/nnit"]) == {"config.json", "model.safetensors"}
+    assert set(hub.files["someone/nnit"]) == {"README.md", "config.json", "model.safetensors"}
+    assert 'get("nnit").from_pretrained' in hub.files["someone/nnit"]["README.md"].decode()
     back, request = NNiT.from_pretrained("someone/nnit", view.task), SampleRequest(view.architectures[0], 2, 0)
     assert torch.equal(back.sample(request).flat(), generator.sample(request).flat())
 

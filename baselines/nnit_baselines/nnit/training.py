@@ -107,7 +107,7 @@ class Trainer:
 def train(model: Transformer, data: list[Packed], mixture: Mixture, run: Run) -> dict[str, Any]:
     """Train `model` in place, to the running mean of its weights; returns the facts for config.json."""
     trainer, settings = Trainer(model, data, mixture, run.seed), mixture.settings
-    log = Log(run.folder)
+    log = Log(run)
     if run.folder is not None:
         run.folder.mkdir(parents=True, exist_ok=True)
         if (run.folder / STATE).is_file():
@@ -138,8 +138,9 @@ class Log:
     Every QUALITY_STEPS steps, and at the end, also the quality of samples of architectures that are learned from.
     """
 
-    def __init__(self, folder: Path | None) -> None:
-        self.path = folder / LOG if folder is not None else None
+    def __init__(self, run: Run) -> None:
+        self.path = run.folder / LOG if run.folder is not None else None
+        self.track = run.track
 
     def cut(self, step: int) -> None:
         """Drop the lines after `step`, written by a run that was stopped before it saved them."""
@@ -155,7 +156,7 @@ class Log:
 
     def add(self, trainer: Trainer, losses: list[float]) -> None:
         """Append the line of the last steps."""
-        if self.path is None:
+        if self.path is None and self.track is None:
             return
         line = {
             "step": trainer.step,
@@ -166,5 +167,8 @@ class Log:
         }
         if trainer.step % QUALITY_STEPS == 0 or trainer.step == trainer.settings.steps:
             line["quality"] = trainer.quality()
-        with self.path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        if self.track is not None:
+            self.track(line)
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write(json.dumps(line) + "\n")
