@@ -1,4 +1,4 @@
-"""A zoo of small robot policies: what a policy is, how a zoo is stored, fetched, checked and built.
+"""A zoo of small policies: what a policy is, how a zoo is stored, fetched, checked and built.
 
 >>> import nnit_zoo
 >>> zoo = nnit_zoo.load("PickCube-v1")  # after `nnit-zoo download --task PickCube-v1`

@@ -93,6 +93,8 @@ With the `nnit` package: `nnit-zoo download --task {task} --source {repository}`
 | `ghn_seed` | seed of the hypernetwork that made the policy; those from 128 on are held out |
 | `success_once`, `success_at_end`, `return` | means over `episodes`; MNIST-PCA32 has its accuracy in `return` |
 | `sha256` | of the parameters as stored |
+| `n_params` | number of weights and biases |
+| `weight_norm` | L2 norm of all parameters |
 | `parameters` | weights and biases |
 
 `<task>/*.safetensors` hold the same weights stacked per architecture, and `index.parquet` says where each policy is.

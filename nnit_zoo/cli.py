@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import errno
 import sys
-from collections.abc import Callable, Collection
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
 from nnit_zoo.console import print_json, print_rows, print_table
 from nnit_zoo.errors import UserError
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from nnit_zoo.files import Manifest
-
 app = App(
     name="nnit-zoo",
-    help="List, fetch, check and build zoos of small robot policies.",
+    help="List, fetch, check and build zoos of small policies.",
     version=lambda: version("nnit"),
     default_parameter=Parameter(negative=""),
 )
@@ -77,6 +71,11 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
             return
         rows = [{"split": split, **row} for split, row in zoo["splits"].items()]
         print_rows(rows, ("split", "architectures", "policies", *files.SCORES))
+        if rates := zoo["pass_rates"]:
+            least = min(rates, key=rates.__getitem__)
+            mean = sum(rates.values()) / len(rates)
+            sys.stdout.write(f"Of the candidates of a seen architecture, {mean:.1%} pass the thresholds; ")
+            sys.stdout.write(f"fewest of {least}: {rates[least]:.1%}.\n")
         if zoo["layout"]:
             print_table(("input", "entries"), list(zoo["layout"].items()))
         return
@@ -114,23 +113,21 @@ def download(
     """
     from nnit_zoo import files
     from nnit_zoo.display import Display
+    from nnit_zoo.download import Download
 
-    manifest, index, bring = _provider(task, source, revision, folder)
-    target = files.default_folder(task) if folder is None else folder
-    splits = split or files.SPLITS
-    wanted = files.shards_of(index, splits)
+    zoo = Download(task, folder, source=source, revision=revision)
+    target, splits = zoo.folder, split or files.SPLITS
     if dry_run:
-        missing = manifest.missing(target, wanted | {files.INDEX})
+        count, missing = len(zoo.wanted(splits)), zoo.missing(splits)
         size, free = sum(entry.size for entry in missing.values()), files.free_bytes(target)
         if as_json:
-            counts = {"files": len(wanted) + 1, "missing": len(missing), "missing_bytes": size, "free_bytes": free}
+            counts = {"files": count, "missing": len(missing), "missing_bytes": size, "free_bytes": free}
             print_json({"task": task, "folder": str(target), **counts})
         else:
-            sys.stdout.write(f"{target}: {len(missing)} of {len(wanted) + 1} files to write, {files.readable(size)}; ")
+            sys.stdout.write(f"{target}: {len(missing)} of {count} files to write, {files.readable(size)}; ")
             sys.stdout.write(f"{files.readable(free)} free\n")
         return
-    with Display(quiet=False).stage(f"{'fetching' if source else 'making'} {task}", len(wanted)) as tell:
-        bring(target, tell, splits)
+    zoo.run(Display(quiet=False), splits)
     if as_json:
         print_json({"task": task, "folder": str(target)})
     else:
@@ -211,10 +208,17 @@ def stats(
     if output is not None:
         for path in analyses.draw(zoo, chosen, output):
             sys.stderr.write(f"{path}\n")
+    twins = analyses.twins(task)
     if as_json:
-        print_json(measures)
-    else:
-        print_rows(measures, tuple(measures[0]))
+        print_json({"zoo": measures, "twins": twins})
+        return
+    print_rows(measures, tuple(measures[0]))
+    if twins:
+        sys.stdout.write("Networks of equal widths, from GHNs and trained by themselves (NNiT 6.1):\n")
+        print_rows(twins, tuple(twins[0]))
+    elif task in analyses.PAPER_TWINS:
+        command = f"nnit-zoo build --task {task} --stage twins"
+        sys.stdout.write(f"For NNiT's comparison with networks that are trained by themselves, run: {command}\n")
 
 
 @app.command
@@ -315,39 +319,12 @@ def main() -> None:
     run(app)
 
 
-def _provider(
-    task: str, source: str | None, revision: str | None, folder: Path | None
-) -> tuple[Manifest, pa.Table, Callable[[Path, Callable[[int], None], Collection[str]], None]]:
-    """A zoo's manifest and index, and what brings its shards: the source if there is one, else the embedded GHNs."""
-    from nnit_zoo import files
-
-    if source is None:
-        if revision:
-            raise UserError("--revision says which version of a --source: give both")
-        embedded = files.embedded(task)
-
-        def make(target: Path, progress: Callable[[int], None], splits: Collection[str]) -> None:
-            from nnit_zoo.materialise import materialise
-
-            materialise(embedded, target, progress, splits)
-
-        return files.Manifest.read(embedded), files.read_index(embedded / files.INDEX), make
-    from io import BytesIO
-
-    from nnit_zoo.hub import Source
-
-    found = Source(source, task, revision)
-    if folder is None and found.manifest != files.Manifest.read(files.embedded(task)):
-        raise UserError(f"{source} holds another version of the zoo than this nnit; keep it elsewhere with --folder")
-    return found.manifest, files.read_index(BytesIO(found.index)), found.fetch
-
-
 def _layout(task: str) -> dict[str, str]:
     """Which entries of the observation hold what, for a task that names them: `{"obj_pose": "29-35"}`."""
-    from nnit_zoo import tasks
+    from nnit_zoo.tasks.layouts import LAYOUTS
 
     entries, start = {}, 0
-    for name, size in getattr(tasks.get(task), "layout", {}).items():
+    for name, size in LAYOUTS.get(task, {}).items():
         entries[name] = f"{start}-{start + size - 1}" if size > 1 else f"{start}"
         start += size
     return entries

@@ -2,7 +2,7 @@
 
 A zoo folder holds `index.parquet` (a row per policy), one safetensors shard per architecture and `manifest.json` with
 the size and SHA-256 of each of them. The embedded folder of a task, in the package, holds the same index and manifest
-beside the GHNs from which the shards are made.
+beside the GHNs from which the shards are made, and `selection.parquet`, a row per candidate.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ Progress = Callable[[int], None]
 EMBEDDED = Path(__file__).parent / "data"
 INDEX = "index.parquet"
 MANIFEST = "manifest.json"
+SELECTION = "selection.parquet"
+HELDOUT_SEEDS_FROM = 128
 INDEX_SCHEMA = pa.schema(
     [
         ("id", pa.string()),
@@ -46,8 +48,11 @@ INDEX_SCHEMA = pa.schema(
         ("shard", pa.string()),
         ("row", pa.int32()),
         ("sha256", pa.string()),
+        ("n_params", pa.int32()),
+        ("weight_norm", pa.float32()),
     ]
 )
+ADDED = ("n_params", "weight_norm")  # columns that the index of an older zoo may lack: they are null then
 
 
 class Entry(BaseModel):
@@ -176,6 +181,10 @@ def sha256_of(path: Path) -> str:
 def read_index(path: Path | io.BytesIO, architecture: str | None = None) -> pa.Table:
     """The rows of an index file, of one architecture if given; columns as in INDEX_SCHEMA."""
     table = pq.ParquetFile(path).read()
+    for name in ADDED:
+        if name not in table.column_names:
+            field = INDEX_SCHEMA.field(name)
+            table = table.append_column(field, pa.nulls(len(table), field.type))
     return table if architecture is None else table.filter(pc.equal(table["architecture"], architecture))
 
 
@@ -191,6 +200,19 @@ def summary(index: pa.Table) -> dict[str, dict[str, Any]]:
         }
         for row in sorted(rows, key=lambda row: SPLITS.index(row["split"]))
     }
+
+
+def pass_rates(selection: Path) -> dict[str, float]:
+    """Per seen architecture, the share of its candidates for the corpus that reach the task's thresholds.
+
+    Empty for an older zoo, which does not say.
+    """
+    table = pq.ParquetFile(selection).read()
+    if "passed" not in table.column_names:
+        return {}
+    candidates = (pc.field("split") == "seen") & (pc.field("ghn_seed") < HELDOUT_SEEDS_FROM)
+    rows = table.filter(candidates).group_by("architecture", use_threads=False).aggregate([("passed", "mean")])
+    return dict(zip(rows["architecture"].to_pylist(), rows["passed_mean"].to_pylist(), strict=True))
 
 
 def tasks_with_zoo() -> tuple[str, ...]:
@@ -221,6 +243,7 @@ def describe(task: str) -> dict[str, Any]:
         "shards": len(manifest.shards),
         "shards_downloaded": sum((place / name).is_file() for name in manifest.shards) if ours else 0,
         "splits": summary(index),
+        "pass_rates": pass_rates(embedded(task) / SELECTION),
     }
 
 

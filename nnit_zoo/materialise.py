@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import struct
 from collections.abc import Collection, Iterator, Sequence
 from copy import deepcopy
@@ -29,12 +30,11 @@ from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_bytes
 from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import SPLITS, Entry, Manifest, Progress
+from nnit_zoo.files import HELDOUT_SEEDS_FROM, SPLITS, Entry, Manifest, Progress
 from nnit_zoo.policy import PolicyBatch, concatenate
-from nnit_zoo.zoo import HELDOUT_SEEDS_FROM, policy_hashes
+from nnit_zoo.zoo import policy_hashes
 
 GHNS = "ghns.safetensors"
-SELECTION = "selection.parquet"
 TIE_MARGIN = 1e-14
 _MOST_TIES = 8  # of one policy that are tried on both sides
 
@@ -84,10 +84,11 @@ def write_manifest(data_folder: Path) -> None:
             raise UserError(f"{ids[int(batch.finite().int().argmin())]} is not finite in float16: do not keep it")
         name = _shard_name(architecture)
         shards[name] = Entry.of(_serialise(batch, source.task))
-        stored = zip(rows, ids, policy_hashes(batch), strict=True)
+        common = {"task": source.task, "shard": name, "n_params": architecture.parameters}
+        stored = zip(rows, ids, policy_hashes(batch), _norms(batch), strict=True)
         index += [
-            {**row, "id": id_, "task": source.task, "shard": name, "row": number, "sha256": sha256}
-            for number, (row, id_, sha256) in enumerate(stored)
+            {**row, **common, "id": id_, "row": number, "sha256": sha256, "weight_norm": norm}
+            for number, (row, id_, sha256, norm) in enumerate(stored)
         ]
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(index, files.INDEX_SCHEMA), buffer, compression="zstd")
@@ -124,7 +125,7 @@ class _Source:
         for number, seed in enumerate(metadata["ghn_seeds"]):
             state = {name: tensor[number] for name, tensor in stacked.items()}
             self._ghns[seed] = GHN.from_state(self.inputs, self.outputs, state).double()
-        self.rows = self._kept_rows(data_folder / SELECTION)
+        self.rows = self._kept_rows(data_folder / files.SELECTION)
 
     def _kept_rows(self, selection: Path) -> dict[Architecture, list[dict[str, Any]]]:
         candidates = pq.ParquetFile(selection).read().to_pylist()
@@ -151,6 +152,11 @@ def _round(exact: PolicyBatch) -> PolicyBatch:
     with np.errstate(over="ignore"):
         layers = tuple(torch.from_numpy(layer.numpy().astype(np.float16)) for layer in exact.layers)
     return PolicyBatch(exact.architecture, layers)
+
+
+def _norms(batch: PolicyBatch) -> list[float]:
+    """L2 norm of each policy's parameters, the same on every machine: squares of float16 are exact, and so is fsum."""
+    return [math.sqrt(math.fsum(squares)) for squares in batch.flat().double().square().tolist()]
 
 
 def _turn_ties(exact: PolicyBatch, hashes: Sequence[str]) -> PolicyBatch:

@@ -39,6 +39,13 @@ def unordered(
     return _in_processes(work, units, workers)
 
 
+def in_chunks(work: Callable[[range], Result], numbers: range, size: int, workers: int) -> list[Result]:
+    """The results of `work` for each `size` numbers in turn, in their order, from processes as in `unordered`."""
+    chunks = [numbers[start : start + size] for start in range(0, len(numbers), size)]
+    results = dict(unordered(work, chunks, workers))
+    return [results[chunk] for chunk in chunks]
+
+
 def _in_processes(work: Callable[[Unit], Result], units: Iterable[Unit], workers: int) -> Iterator[tuple[Unit, Result]]:
     # Not joblib.Parallel: when its pool breaks, it does not say what was in work.
     from joblib.externals.loky import get_reusable_executor  # noqa: PLC0415  only parallel work needs it

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.compute as pc
 from torch import Tensor
 
-from nnit_zoo import diversity, tasks
+from nnit_zoo import diversity, files, tasks
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
@@ -38,6 +41,20 @@ PAPER = {  # NNiT's tables of data set diversity and CKA, and its permutation ab
     "PushCube-v1": {NEAREST_L2: 49.66, NEAREST_COSINE: 0.12},
     "StackCubeEasy-v1": {NEAREST_L2: 72.79, NEAREST_COSINE: 0.21},
 }
+TWINS = "twins.json"
+PAPER_TWINS = {  # NNiT's tables 1 and of CKA, and its permutation ablation: of GHNs, and trained by themselves
+    "PickCube-v1": {
+        "return": (39.35, 39.49),
+        "success_at_end": (0.990, 0.989),
+        NEAREST_L2: (54.66, 41.73),
+        NEAREST_COSINE: (0.07, 0.02),
+        CORRELATION: (0.65, 0.0),
+        "CKA, layer 1": (0.917, 0.957),
+        "CKA, layer 2": (0.880, 0.926),
+        "CKA, layer 3": (0.751, 0.918),
+        "CKA, mean": (0.849, 0.933),
+    }
+}
 
 
 def analyse(zoo: Zoo, chosen: Sequence[Architecture], progress: Progress | None = None) -> list[dict[str, Any]]:
@@ -51,7 +68,8 @@ def analyse(zoo: Zoo, chosen: Sequence[Architecture], progress: Progress | None 
     for architecture in dict.fromkeys([*chosen, *zoo.architectures("seen")]):
         batch = zoo.batch(architecture, "seen")
         if len(batch) > 1 or architecture in chosen:
-            columns[str(architecture)] = dict(_alignment(batch, _shuffled(zoo, architecture)))
+            shuffled = _correlations(_shuffled(zoo, architecture))
+            columns[str(architecture)] = alignment(batch) | {PERMUTED: fmean(shuffled[1:])}
         if progress:
             progress(1)
     averages = {
@@ -59,7 +77,7 @@ def analyse(zoo: Zoo, chosen: Sequence[Architecture], progress: Progress | None 
     }
     for architecture in chosen:
         if observations is not None:
-            columns[str(architecture)] |= _similarity(zoo.batch(architecture, "seen"), observations)
+            columns[str(architecture)] |= similarity(zoo.batch(architecture, "seen"), observations)
         if progress:
             progress(1)
     names = [str(architecture) for architecture in chosen]
@@ -80,20 +98,49 @@ def _shuffled(zoo: Zoo, architecture: Architecture) -> PolicyBatch:
     return permuted(view, "policy", seed=0).batches[architecture]
 
 
-def _alignment(batch: PolicyBatch, shuffled: PolicyBatch) -> Iterator[tuple[str, float]]:
-    yield NEAREST_L2, float(diversity.off_diagonal(diversity.distances(batch)).amin(1).mean())
-    yield NEAREST_COSINE, float(diversity.off_diagonal(diversity.cosines(batch)).amax(1).mean())
-    layers = [diversity.mean_correlation(layer) for layer in diversity.magnitudes(batch)]
-    for number, value in enumerate(layers, 1):
-        yield f"|W| r, layer {number}", value
-    yield CORRELATION, fmean(layers[1:])
-    yield PERMUTED, fmean(map(diversity.mean_correlation, diversity.magnitudes(shuffled)[1:]))
+def alignment(batch: PolicyBatch) -> dict[str, float]:
+    """Distances to the nearest neighbour and correlations of |W|; raises UserError for fewer than two policies."""
+    layers = _correlations(batch)
+    return {
+        NEAREST_L2: float(diversity.off_diagonal(diversity.distances(batch)).amin(1).mean()),
+        NEAREST_COSINE: float(diversity.off_diagonal(diversity.cosines(batch)).amax(1).mean()),
+        **{f"|W| r, layer {number}": value for number, value in enumerate(layers, 1)},
+        CORRELATION: fmean(layers[1:]),
+    }
 
 
-def _similarity(batch: PolicyBatch, observations: Tensor) -> dict[str, float]:
+def _correlations(batch: PolicyBatch) -> list[float]:
+    return [diversity.mean_correlation(layer) for layer in diversity.magnitudes(batch)]
+
+
+def similarity(batch: PolicyBatch, observations: Tensor) -> dict[str, float]:
+    """CKA of each hidden layer on standardised observations [b, inputs], mean over pairs, and the layers' mean."""
     layers = diversity.cka(batch, observations).mean(1)
     measures = {f"CKA, layer {number}": float(value) for number, value in enumerate(layers, 1)}
     return measures | {"CKA, mean": float(layers.mean())}
+
+
+def population(batch: PolicyBatch, scores: pa.Table, observations: Tensor) -> dict[str, float]:
+    """All measures of a population of twins, with its mean `scores`, a table in EPISODE_SCHEMA."""
+    means = {column: pc.mean(scores[column]).as_py() for column in ("return", "success_at_end")}
+    return means | alignment(batch) | similarity(batch, observations)
+
+
+def twins(task: str) -> list[dict[str, Any]]:
+    """Rows of a table: `measure`, its value for twins of each kind, and the paper's; empty if they were not built."""
+    path = files.EMBEDDED / task / TWINS
+    if not path.exists():
+        return []
+    found = json.loads(path.read_text())["populations"]
+    return [
+        {
+            "measure": measure,
+            **{kind: values[measure] for kind, values in found.items()},
+            **dict(zip((f"paper, {kind}" for kind in found), paper, strict=True)),
+        }
+        for measure in next(iter(found.values()))
+        for paper in [PAPER_TWINS.get(task, {}).get(measure, (None, None))]
+    ]
 
 
 def draw(zoo: Zoo, chosen: Sequence[Architecture], folder: Path) -> Iterator[Path]:

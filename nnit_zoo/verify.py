@@ -12,8 +12,8 @@ import torch
 from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture, split_of
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import Progress
-from nnit_zoo.zoo import HELDOUT_SEEDS_FROM, Zoo, damaged, policy_hashes, read_shard
+from nnit_zoo.files import HELDOUT_SEEDS_FROM, Progress
+from nnit_zoo.zoo import Zoo, damaged, policy_hashes, read_shard
 
 TOLERANCE = 0.05  # of a score, or of 1 if that is more
 
@@ -67,13 +67,19 @@ def rescore(
     ids = zoo.index["id"].to_pylist()
     count = min(count, len(ids))
     chosen = [zoo[ids[len(ids) * number // count]] for number in range(count)]
-    table = task.evaluate([policy.weights for policy in chosen], task.scoring_seeds, progress=progress)
-    means = table.group_by("policy", use_threads=False).aggregate([(score, "mean") for score in files.SCORES])
+    now: dict[str, dict[str, Any]] = {}
+    for episodes in dict.fromkeys(policy.record["episodes"] for policy in chosen):
+        group = [policy for policy in chosen if policy.record["episodes"] == episodes]
+        table = task.evaluate([policy.weights for policy in group], task.scoring_seeds[:episodes], progress=progress)
+        means = table.group_by("policy", use_threads=False).aggregate([(score, "mean") for score in files.SCORES])
+        now |= {
+            policy.record["id"]: row for policy, row in zip(group, means.sort_by("policy").to_pylist(), strict=True)
+        }
     rows = []
-    for policy, now in zip(chosen, means.sort_by("policy").to_pylist(), strict=True):
+    for policy in chosen:
         row = {"id": policy.record["id"], "agrees": True}
         for score in files.SCORES:
-            before, after = policy.record[score], now[f"{score}_mean"]
+            before, after = policy.record[score], now[row["id"]][f"{score}_mean"]
             row |= {f"stored_{score}": before, f"now_{score}": after}
             row["agrees"] &= before is None or abs(after - before) <= TOLERANCE * max(before, 1)
         rows.append(row)

@@ -17,10 +17,8 @@ from torch import nn
 from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture, split_of
 from nnit_zoo.errors import UserError, unknown_name
-from nnit_zoo.files import SPLITS
+from nnit_zoo.files import HELDOUT_SEEDS_FROM, SPLITS
 from nnit_zoo.policy import PolicyBatch
-
-HELDOUT_SEEDS_FROM = 128
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,8 @@ class Zoo:
 
     Iterating gives every `Policy` in index order, and `zoo["PickCube-v1/32-16-64-32/005"]` the one with that id.
     `index` has a row per policy: id, task, architecture, ghn_seed, split, success_once, success_at_end, return,
-    episodes, shard, row, sha256. `split` is `seen`, `unseen`, `excluded`, or `heldout_seed` for GHN seeds from 128 on.
+    episodes, shard, row, sha256, n_params, weight_norm. `split` is `seen`, `unseen`, `excluded`, or `heldout_seed` for
+    GHN seeds from 128 on.
     """
 
     def __init__(self, folder: Path, manifest: files.Manifest, index: pa.Table) -> None:

@@ -6,7 +6,8 @@ a few on-policy rounds then show each GHN the states that its own policies reach
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from nnit_zoo.atomic import write_atomically
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
 from nnit_zoo.build.ghn import GHN
+from nnit_zoo.parallel import in_chunks
 from nnit_zoo.sim.control import Controller
 from nnit_zoo.sim.rollout import rollout
 from nnit_zoo.sim.tabletop import Array
@@ -60,18 +62,22 @@ def standardise(task: RobotPolicyTask, observations: Array) -> Array:
 def collect(
     task: RobotPolicyTask,
     network: experts.Network,
-    students: Sequence[Sequence[Array]],
-    seeds: range,
+    students: Mapping[int, Sequence[Array]],
     beta: float,
     noise: float,
+    seeds: range,
 ) -> Array:
     """Raw observations [len(seeds) * steps, inputs] of episodes in which the teacher acts with probability `beta`.
 
-    Student i acts in episode i. The teacher's actions get Gaussian noise, of a scale drawn per episode up to `noise`.
-    """  # fmt: skip
+    Otherwise the student of this seed does; without students, the teacher always acts. Its actions get Gaussian noise,
+    of a scale drawn per episode up to `noise`.
+    """
     generator = np.random.default_rng(seeds.start)
     scales = generator.uniform(0, noise, (len(seeds), 1)).astype(np.float32)
-    controller = Controller(students, task.observation_mean, task.observation_std) if students else None
+    controller = None
+    if students:
+        networks = [students[seed] for seed in seeds]
+        controller = Controller(networks, task.observation_mean, task.observation_std)
 
     def act(observations: Array) -> Array:
         actions = np.clip(experts.mean_action(network, observations), -1, 1)
@@ -93,30 +99,22 @@ def gather_states(
     log: Callable[[str], None],
 ) -> None:
     """Make `folder`/states.safetensors, raw observations [s, inputs], with a file per DAgger round on the way."""
-    from joblib import Parallel, delayed  # noqa: PLC0415  part of the simulator's extra
-
     ghn = GHN(task.inputs, task.outputs, COLLECTOR)
     fit = Fit(ghn, config, COLLECTOR)
     optimizer = torch.optim.AdamW(ghn.parameters(), lr=config.round_learning_rate)
     gathered: list[Array] = []
-    with Parallel(n_jobs=workers) as pool:
-        for round_ in range(config.rounds):
-            first = COLLECTION_SEEDS + round_ * config.episodes_per_round
-            seeds = range(first, first + config.episodes_per_round)
-            chunks = [seeds[start : start + 50] for start in range(0, len(seeds), 50)]
-            students = [_students(ghn, fit, len(chunk)) if round_ else [] for chunk in chunks]
-            path = folder / f"round-{round_}.safetensors"
-            if not path.exists():
-                beta = config.teacher_decay**round_
-                jobs = [
-                    delayed(collect)(task, network, *chunk, beta, config.action_noise)
-                    for chunk in zip(students, chunks, strict=True)
-                ]
-                _save_states(path, np.concatenate(pool(jobs)))
-            gathered.append(load_arrays(path)["states"])
-            inputs, labels = labelled(task, network, np.concatenate(gathered))
-            loss = fit.run(inputs, labels, config.round_steps, optimizer)
-            log(f"states: round {round_ + 1} of {config.rounds}, {len(inputs):,} states, loss {loss:.4f}")
+    for round_ in range(config.rounds):
+        first = COLLECTION_SEEDS + round_ * config.episodes_per_round
+        seeds = range(first, first + config.episodes_per_round)
+        students = dict(zip(seeds, _students(ghn, fit, len(seeds)), strict=True)) if round_ else {}
+        path = folder / f"round-{round_}.safetensors"
+        if not path.exists():
+            work = partial(collect, task, network, students, config.teacher_decay**round_, config.action_noise)
+            _save_states(path, np.concatenate(in_chunks(work, seeds, 50, workers)))
+        gathered.append(load_arrays(path)["states"])
+        inputs, labels = labelled(task, network, np.concatenate(gathered))
+        loss = fit.run(inputs, labels, config.round_steps, optimizer)
+        log(f"states: round {round_ + 1} of {config.rounds}, {len(inputs):,} states, loss {loss:.4f}")
     _save_states(folder / "states.safetensors", np.concatenate(gathered))
 
 
@@ -126,13 +124,13 @@ def _save_states(path: Path, states: Array) -> None:
 
 def _students(ghn: GHN, fit: Fit, count: int) -> list[list[Array]]:
     """The GHN's policies of `count` seen architectures drawn at random, as arrays."""
-    chosen = torch.randint(len(fit.seen), (count,), generator=fit.generator).tolist()
+    chosen = torch.randint(len(fit.architectures), (count,), generator=fit.generator).tolist()
     cache: dict[Architecture, list[Array]] = {}
     for index in chosen:
-        architecture = fit.seen[index]
+        architecture = fit.architectures[index]
         if architecture not in cache:
             cache[architecture] = [layer[0].numpy() for layer in ghn.emit(architecture).layers]
-    return [cache[fit.seen[index]] for index in chosen]
+    return [cache[fit.architectures[index]] for index in chosen]
 
 
 def labelled(task: RobotPolicyTask, network: experts.Network, observations: Array) -> tuple[Tensor, Tensor]:

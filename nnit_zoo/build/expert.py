@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from nnit_zoo.atomic import write_atomically, write_json
+from nnit_zoo.parallel import in_chunks
 from nnit_zoo.sim.rollout import Episodes, rollout
 from nnit_zoo.sim.tabletop import Array
 from nnit_zoo.tasks.robot import RobotPolicyTask
@@ -123,14 +125,6 @@ def play(task: RobotPolicyTask, network: Network, seeds: range, noise: tuple[Arr
     return rollout(task, seeds, act)
 
 
-def evaluate(task: RobotPolicyTask, network: Network, pool: Any, seeds: range) -> list[Episodes]:
-    """Deterministic episodes of the expert over seeds, shared out to the pool's workers."""
-    from joblib import delayed  # noqa: PLC0415  part of the simulator's extra
-
-    chunks = [seeds[start : start + 50] for start in range(0, len(seeds), 50)]
-    return list(pool(delayed(play)(task, network, chunk) for chunk in chunks))
-
-
 class Training:
     """PPO's state: everything that a resumed run needs to go on as if it had not stopped."""
 
@@ -169,19 +163,17 @@ class Training:
         self.generator.set_state(state["generator"])
         self.iteration, self.best_return = state["iteration"], state["best_return"]
 
-    def iterate(self, pool: Any) -> float:
+    def iterate(self, workers: int) -> float:
         """Roll out one episode per environment, update, and return the mean undiscounted return."""
-        from joblib import delayed  # noqa: PLC0415  part of the simulator's extra
-
-        config = self.config
-        network = network_of(self.model.actor)
+        task, network = self.task, network_of(self.model.actor)
         std = self.model.log_std.detach().exp().numpy()
-        first = TRAINING_SEEDS + self.iteration * config.environments
-        seeds = range(first, first + config.environments)
+        first = TRAINING_SEEDS + self.iteration * self.config.environments
+
+        def explore(unit: range) -> Episodes:
+            return play(task, network, unit, (std, first + (unit.start - first) // UNIT))
+
         # Units of a fixed size, each with noise of its own: the number of workers changes no number.
-        units = [seeds[start : start + UNIT] for start in range(0, len(seeds), UNIT)]
-        jobs = [delayed(play)(self.task, network, unit, (std, first + index)) for index, unit in enumerate(units)]
-        episodes = pool(jobs)
+        episodes = in_chunks(explore, range(first, first + self.config.environments), UNIT, workers)
         observations = torch.from_numpy(np.concatenate([part.observations for part in episodes], axis=1))
         actions = torch.from_numpy(np.concatenate([part.actions for part in episodes], axis=1))
         rewards = torch.from_numpy(np.concatenate([part.rewards for part in episodes], axis=1))
@@ -234,31 +226,29 @@ def train(
 
     Returns the record of the best expert: its deterministic scores over 200 episodes, steps and seconds.
     """
-    from joblib import Parallel  # noqa: PLC0415  part of the simulator's extra
-
     folder.mkdir(parents=True, exist_ok=True)
     training = Training(task, config)
     if (folder / "state.pt").exists():
         training.restore(folder / "state.pt")
         log(f"resuming the expert at {training.steps:,} steps")
     record: dict[str, Any] = json.loads((folder / "record.json").read_text()) if training.best_return else {}
-    with Parallel(n_jobs=workers) as pool:
-        while training.steps < config.total_steps and not good_enough(config, record):
-            started = time.monotonic()
-            mean_return = training.iterate(pool)
-            if training.iteration % config.evaluate_every:
-                continue
-            scores = summarise(evaluate(task, network_of(training.model.actor), pool, EVALUATION_SEEDS))
-            entry = {"steps": training.steps, "training_return": mean_return, **scores}
-            log(f"expert {json.dumps(entry)} ({time.monotonic() - started:.1f} s)")
-            with (folder / "log.jsonl").open("a") as lines:
-                lines.write(json.dumps(entry) + "\n")
-            if scores["return"] > training.best_return:
-                training.best_return = scores["return"]
-                save(network_of(training.model.actor), folder / "expert.safetensors")
-                record = entry
-                write_json(folder / "record.json", record)
-            training.save(folder / "state.pt")
+    while training.steps < config.total_steps and not good_enough(config, record):
+        started = time.monotonic()
+        mean_return = training.iterate(workers)
+        if training.iteration % config.evaluate_every:
+            continue
+        network = network_of(training.model.actor)
+        scores = summarise(in_chunks(partial(play, task, network), EVALUATION_SEEDS, 50, workers))
+        entry = {"steps": training.steps, "training_return": mean_return, **scores}
+        log(f"expert {json.dumps(entry)} ({time.monotonic() - started:.1f} s)")
+        with (folder / "log.jsonl").open("a") as lines:
+            lines.write(json.dumps(entry) + "\n")
+        if scores["return"] > training.best_return:
+            training.best_return = scores["return"]
+            save(network, folder / "expert.safetensors")
+            record = entry
+            write_json(folder / "record.json", record)
+        training.save(folder / "state.pt")
     return record
 
 

@@ -1,4 +1,4 @@
-"""Fitting a GHN to labelled states by gradient steps, over seen architectures drawn at random."""
+"""Fitting a GHN to labelled states by gradient steps, over architectures drawn at random."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from nnit_zoo.architecture import architectures
+from nnit_zoo.architecture import Architecture, architectures
 from nnit_zoo.atomic import write_atomically
 from nnit_zoo.build.ghn import GHN
 
@@ -33,15 +33,22 @@ class FitConfig(BaseModel):
 
 
 class Fit:
-    """Fits a GHN, on architectures drawn at random from the seen ones, to labelled states.
+    """Fits a GHN, on architectures drawn at random from those given, by default the seen ones, to labelled states.
 
     Each block gets Gaussian noise of `weight_noise` times its root mean square: policies then survive weight errors of
     a few per cent, which generated policies have.
     """
 
-    def __init__(self, ghn: GHN, config: FitConfig, seed: int, loss: Loss = nn.functional.mse_loss) -> None:
+    def __init__(
+        self,
+        ghn: GHN,
+        config: FitConfig,
+        seed: int,
+        loss: Loss = nn.functional.mse_loss,
+        chosen: Sequence[Architecture] = (),
+    ) -> None:
         self.ghn, self.config, self.loss = ghn, config, loss
-        self.seen = architectures("seen", ghn.inputs, ghn.outputs)
+        self.architectures = chosen or architectures("seen", ghn.inputs, ghn.outputs)
         self.generator = torch.Generator().manual_seed(seed)
 
     def run(
@@ -56,8 +63,8 @@ class Fit:
         shared, from_shared = len(states) - own, config.states_per_architecture - from_own
         recent: list[float] = []
         for _ in range(steps):
-            chosen = torch.randperm(len(self.seen), generator=draw)[: config.architectures_per_step].tolist()
-            networks = self.ghn([self.seen[index] for index in chosen])
+            chosen = torch.randperm(len(self.architectures), generator=draw)[: config.architectures_per_step].tolist()
+            networks = self.ghn([self.architectures[index] for index in chosen])
             loss = torch.zeros(())
             for blocks in networks:
                 rows = torch.randint(shared, (from_shared,), generator=draw)

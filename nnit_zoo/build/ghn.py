@@ -6,7 +6,9 @@ says; the code it cites does not (docs/deviations.md).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -16,37 +18,44 @@ from nnit_zoo.architecture import Architecture, vocabulary
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
 
-CANVAS = 64  # largest width that the decoder can emit
+_START_SIZE = 8  # rows and columns of the first feature map; each block of the decoder doubles them
 _WIDTH = 32  # of a node's embedding, and channels of the first feature map
 _START_STD = 0.6  # of the raw canvas at the start; with it every seed trained
 
 
 class GHN(nn.Module):
-    """Emits the policy of any listed architecture; its seed draws the initial weights.
+    """Emits the policy of any architecture with these hidden `widths` and `layers`; its seed draws the initial weights.
 
-    Raises UserError for tasks with more than 64 inputs or outputs.
+    Without `widths`, they are the vocabulary. The decoder's `canvas` is as wide as the widest, and its number of blocks
+    follows from that. Raises UserError for tasks with more inputs or outputs than the canvas.
     """
 
-    def __init__(self, inputs: int, outputs: int, seed: int) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, seed: int, widths: Sequence[int] | None = None, layers: int = 5
+    ) -> None:
         super().__init__()
-        if max(inputs, outputs) > CANVAS:
-            raise UserError(f"GHNs emit layers up to {CANVAS} wide, not {inputs} inputs to {outputs} outputs")
+        widths = widths or vocabulary()
+        blocks = math.ceil(math.log2(max(widths) / _START_SIZE))
+        self.canvas = _START_SIZE * 2**blocks
+        if max(inputs, outputs) > self.canvas:
+            raise UserError(f"GHNs emit layers up to {self.canvas} wide, not {inputs} inputs to {outputs} outputs")
         self.inputs, self.outputs = inputs, outputs
         self._tokens = {("in", inputs): 0, ("out", outputs): 1}
-        self._tokens |= {("hidden", width): 2 + index for index, width in enumerate(vocabulary())}
+        self._tokens |= {("hidden", width): 2 + index for index, width in enumerate(widths)}
+        channels = [_WIDTH, *(max(32 // 2**block, 8) for block in range(blocks - 1)), 1]
+        self._ups = [f"up{number}" for number in range(1, blocks + 1)]
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.embed_in = nn.Embedding(len(self._tokens), _WIDTH)
             self.embed_out = nn.Embedding(len(self._tokens), _WIDTH)
-            self.embed_layer = nn.Embedding(5, _WIDTH)
+            self.embed_layer = nn.Embedding(layers, _WIDTH)
             self.chain = nn.GRU(_WIDTH, _WIDTH // 2, batch_first=True, bidirectional=True)
             self.norm = nn.LayerNorm(_WIDTH)
-            self.lift = nn.Linear(_WIDTH, _WIDTH * 8 * 8)
-            self.up1 = nn.ConvTranspose2d(_WIDTH, 32, 4, 2, 1)
-            self.up2 = nn.ConvTranspose2d(32, 16, 4, 2, 1)
-            self.up3 = nn.ConvTranspose2d(16, 1, 4, 2, 1)
-            self.up_bias = nn.ConvTranspose1d(16, 1, 4, 2, 1)
-            self._scale_canvas()
+            self.lift = nn.Linear(_WIDTH, _WIDTH * _START_SIZE**2)
+            for name, (into, out) in zip(self._ups, pairwise(channels), strict=True):
+                self.add_module(name, nn.ConvTranspose2d(into, out, 4, 2, 1))
+            self.up_bias = nn.ConvTranspose1d(channels[-2], 1, 4, 2, 1)
+            self._scale_canvas(max(widths))
 
     @classmethod
     def from_state(cls, inputs: int, outputs: int, state: Mapping[str, Tensor]) -> GHN:
@@ -56,11 +65,12 @@ class GHN(nn.Module):
         return ghn
 
     @torch.no_grad()
-    def _scale_canvas(self) -> None:
+    def _scale_canvas(self, width: int) -> None:
         """Scale the last kernel so that raw canvases start with standard deviation 0.6."""
-        nodes = self.embed([Architecture(self.inputs, (64, 64, 64, 64), self.outputs)])
+        hidden = (width,) * (self.embed_layer.num_embeddings - 1)
+        nodes = self.embed([Architecture(self.inputs, hidden, self.outputs)])
         weights, _ = self.decode(nodes.flatten(0, 1))
-        self.up3.weight.mul_(_START_STD / weights.std())
+        self.get_parameter(f"{self._ups[-1]}.weight").mul_(_START_STD / weights.std())
 
     def embed(self, architectures: Sequence[Architecture]) -> Tensor:
         """Node embeddings [a, layers, 32] of `a` architectures of equal depth: one node per layer, on a chain."""
@@ -74,23 +84,25 @@ class GHN(nn.Module):
         hidden = [("hidden", width) for width in architecture.hidden]
         names = [("in", architecture.inputs), *hidden, ("out", architecture.outputs)]
         unknown = [f"{kind} width {width}" for kind, width in names if (kind, width) not in self._tokens]
-        if unknown or len(names) != 6:
+        if unknown or len(names) != self.embed_layer.num_embeddings + 1:
             raise UserError(f"this GHN has no embedding for {', '.join(unknown) or f'{len(names) - 2} hidden layers'}")
         return [self._tokens[name] for name in names]
 
     def decode(self, nodes: Tensor) -> tuple[Tensor, Tensor]:
-        """Raw canvases [n, 64, 64] (rows = output neurons) and biases [n, 64] of node embeddings [n, 32]."""
-        field = F.silu(self.lift(nodes)).view(-1, _WIDTH, 8, 8)
-        field = F.silu(self.up1(field))
-        field = F.silu(self.up2(field))
+        """Raw canvases [n, canvas, canvas] (rows = output neurons), biases [n, canvas] of node embeddings [n, 32]."""
+        field = F.silu(self.lift(nodes)).view(-1, _WIDTH, _START_SIZE, _START_SIZE)
+        *middle, last = (self.get_submodule(name) for name in self._ups)
+        for up in middle:
+            field = F.silu(up(field))
         biases = self.up_bias(field.mean(dim=3))
-        return self.up3(field)[:, 0], biases[:, 0]
+        return last(field)[:, 0], biases[:, 0]
 
     def forward(self, architectures: Sequence[Architecture]) -> list[list[Tensor]]:
         """Blocks [out, in + 1] of each architecture's layers: the canvas's corner over sqrt(fan-in), and the bias."""
         nodes = self.embed(architectures)
         weights, biases = self.decode(nodes.flatten(0, 1))
-        weights, biases = weights.view(*nodes.shape[:2], CANVAS, CANVAS), biases.view(*nodes.shape[:2], CANVAS)
+        weights = weights.view(*nodes.shape[:2], self.canvas, self.canvas)
+        biases = biases.view(*nodes.shape[:2], self.canvas)
         networks = []
         for index, architecture in enumerate(architectures):
             blocks = []

@@ -1,6 +1,6 @@
 """`nnit-zoo build`: its stages, each resumable; a killed build goes on where it stopped.
 
-Robot tasks: expert, states, ghns, scores, pack. MNIST-PCA32: features, ghns, scores, pack.
+Robot tasks: expert, states, ghns, scores, pack, and twins if asked for. MNIST-PCA32: features, ghns, scores, pack.
 
 Intermediate states go to the work folder, finished artifacts to the package's data folder of the task.
 """
@@ -24,27 +24,28 @@ import torch
 from cyclopts import Parameter
 from safetensors.torch import load_file, save_file
 
-from nnit_zoo import tasks
+from nnit_zoo import stats, tasks
 from nnit_zoo.architecture import SPLITS, Architecture, architectures
 from nnit_zoo.atomic import write_atomically, write_json
-from nnit_zoo.build import distill, mnist
+from nnit_zoo.build import distill, mnist, twins
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.ghn import GHN
+from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
+from nnit_zoo.files import HELDOUT_SEEDS_FROM, SELECTION
 from nnit_zoo.materialise import stored, write_manifest
 from nnit_zoo.parallel import Backend, unordered
-from nnit_zoo.policy import concatenate
+from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.provenance import commit
 from nnit_zoo.sim.tabletop import require_simulator
 from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.robot import RobotPolicyTask
 from nnit_zoo.tasks.task import PROBE, Task, data_folder
-from nnit_zoo.zoo import HELDOUT_SEEDS_FROM
 
-Stage = Literal["all", "expert", "states", "features", "ghns", "scores", "pack"]
+Stage = Literal["all", "expert", "states", "features", "ghns", "scores", "pack", "twins"]
 POLICIES_PER_ARCHITECTURE = 100
 PROBE_STATES = 2000
 STD_FLOOR = 0.05  # keeps near-constant observations from being blown up; decides the weight error policies survive
@@ -57,6 +58,7 @@ SELECTION_SCHEMA = pa.schema(
         ("success_at_end", pa.float64()),
         ("return", pa.float64()),
         ("episodes", pa.int64()),
+        ("passed", pa.bool_()),
         ("kept", pa.bool_()),
     ]
 )
@@ -80,7 +82,8 @@ def build(
 ) -> None:
     """Build a task's zoo: what its GHNs learn from, one GHN per seed, every candidate's scores, and those that pass.
 
-    Run it again after a kill, at any moment, and it goes on. With `--stage`, only that stage.
+    Run it again after a kill, at any moment, and it goes on. With `--stage`, only that stage. The stage `twins` is not
+    part of `all`: it makes nothing for the zoo, but NNiT's comparison of networks from GHNs with others, for `stats`.
     """
     torch.set_num_threads(1)
     chosen = tasks.get(task)
@@ -89,14 +92,15 @@ def build(
         require_simulator()
         builder = RobotBuilder(chosen, work / task, seeds, workers, parallel)
     elif isinstance(chosen, MNISTPCA32):
-        builder = MNISTBuilder(chosen, work / task, seeds, workers, source)
+        builder = MNISTBuilder(chosen, work / task, seeds, workers, parallel)
+        builder.source = source
     else:
         raise UserError(f"--source is not for {task}" if source else f"this command cannot build {task}")
-    if stage not in ("all", *builder.stages):
-        raise UserError(f"building {task} has no stage '{stage}': there are {', '.join(builder.stages)}")
-    for name in builder.stages:
-        if stage in ("all", name):
-            getattr(builder, name)()
+    known = (*builder.stages, *builder.analyses)
+    if stage not in ("all", *known):
+        raise UserError(f"building {task} has no stage '{stage}': there are {', '.join(known)}")
+    for name in builder.stages if stage == "all" else (stage,):
+        getattr(builder, name)()
 
 
 def log(message: str) -> None:
@@ -108,6 +112,10 @@ class Builder(ABC):
     """The stages of one task's build over GHN seeds 0 .. `seeds` - 1; the last three are the same for all tasks."""
 
     stages: ClassVar[tuple[str, ...]]
+    analyses: ClassVar[tuple[str, ...]] = ()
+    """Stages that the zoo can do without."""
+    yardstick_episodes: ClassVar[int | None] = None
+    """How many of the scoring episodes a policy plays that cannot enter the corpus; all, if None."""
 
     def __init__(self, task: Task, work: Path, seeds: int, workers: int, parallel: Backend = "processes") -> None:
         self.task, self.work, self.workers, self.parallel = task, work, workers, parallel
@@ -136,41 +144,52 @@ class Builder(ABC):
 
     def scores(self) -> None:
         """Score every candidate, on exactly its stored float16 weights; a file per architecture."""
-        listed = (architectures(split, self.task.inputs, self.task.outputs) for split in SPLITS)
-        missing = [architecture for each in listed for architecture in each if not self._is_scored(architecture)]
-        episodes = len(self.seeds) * len(self.task.scoring_seeds)
-        with Display(quiet=False).stage("scores: episodes", len(missing) * episodes) as advance:
-            for architecture in missing:
-                self._score(architecture, advance)
+        listed = [(split, each) for split in SPLITS for each in architectures(split, *self._sizes)]
+        missing = [(split, architecture) for split, architecture in listed if not self._is_scored(architecture)]
+        count = sum(len(seeds) * len(episodes) for split, _ in missing for seeds, episodes in self._to_score(split))
+        with Display(quiet=False).stage("scores: episodes", count) as advance:
+            for split, architecture in missing:
+                self._score(split, architecture, advance)
         shutil.rmtree(self._units, ignore_errors=True)
+
+    def _to_score(self, split: str) -> list[tuple[list[int], range]]:
+        """GHN seeds, in order, and the episodes that their policies of this split's architectures play."""
+        candidates = [seed for seed in self.seeds if not is_yardstick(split, seed)]
+        yardsticks = [seed for seed in self.seeds if is_yardstick(split, seed)]
+        episodes = self.task.scoring_seeds
+        groups = [(candidates, episodes), (yardsticks, episodes[: self.yardstick_episodes])]
+        return [(seeds, episodes) for seeds, episodes in groups if seeds]
 
     def _is_scored(self, architecture: Architecture) -> bool:
         path = self._scores(architecture)
         return path.exists() and {*pq.read_table(path)["ghn_seed"].to_pylist()} == {*self.seeds}
 
-    def _score(self, architecture: Architecture, advance: Callable[[int], None]) -> None:
-        ghns = [GHN.from_state(self.task.inputs, self.task.outputs, load_file(self._ghn(seed))) for seed in self.seeds]
-        policies = concatenate(stored(ghn, architecture) for ghn in ghns)
-        table = self.task.evaluate(
-            [policies],
-            self.task.scoring_seeds,
-            workers=self.workers,
-            parallel=self.parallel,
-            store=self._units,
-            progress=advance,
-        )
-        seeds = pa.array([self.seeds[index] for index in table["policy"].to_pylist()], pa.int32())
-        table = table.set_column(0, "ghn_seed", seeds).drop_columns(["reason"])
+    def _score(self, split: str, architecture: Architecture, advance: Callable[[int], None]) -> None:
+        tables = []
+        for seeds, episodes in self._to_score(split):
+            ghns = (GHN.from_state(*self._sizes, load_file(self._ghn(seed))) for seed in seeds)
+            policies = concatenate(stored(ghn, architecture) for ghn in ghns)
+            scored = self._evaluate(policies, episodes, self._units, advance)
+            ghn_seeds = pa.array([seeds[index] for index in scored["policy"].to_pylist()], pa.int32())
+            tables.append(scored.set_column(0, "ghn_seed", ghn_seeds).drop_columns(["reason"]))
+        table = pa.concat_tables(tables)
         write_atomically(self._scores(architecture), lambda temporary: pq.write_table(table, temporary))
         means = ", ".join(f"{metric.label} {pc.mean(table[metric.column]).as_py():.3f}" for metric in self.task.metrics)
         log(f"scores: {architecture} {means}")
+
+    def _evaluate(
+        self, policies: PolicyBatch, episodes: range, store: Path, advance: Callable[[int], None]
+    ) -> pa.Table:
+        return self.task.evaluate(
+            [policies], episodes, workers=self.workers, parallel=self.parallel, store=store, progress=advance
+        )
 
     def pack(self) -> None:
         """Select per architecture by the thresholds and write the scores, the selection, the index and the manifest."""
         rows: list[dict[str, Any]] = []
         tables: list[pa.Table] = []
         for split in SPLITS:
-            for architecture in architectures(split, self.task.inputs, self.task.outputs):
+            for architecture in architectures(split, *self._sizes):
                 if not self._is_scored(architecture):
                     raise UserError(f"{architecture} is not scored yet; run the stage 'scores' first")
                 table = pq.read_table(self._scores(architecture))
@@ -181,17 +200,22 @@ class Builder(ABC):
             lambda temporary: pq.write_table(pa.concat_tables(tables), temporary, compression="zstd"),
         )
         write_atomically(
-            self.data / "selection.parquet",
+            self.data / SELECTION,
             lambda temporary: pq.write_table(
                 pa.Table.from_pylist(rows, SELECTION_SCHEMA), temporary, compression="zstd"
             ),
         )
         write_manifest(self.data)
-        seen = [row for row in rows if row["split"] == "seen" and row["ghn_seed"] < HELDOUT_SEEDS_FROM]
-        passed = sum(row["kept"] for row in seen)
+        seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]
+        passed, kept = (sum(row[name] for row in seen) for name in ("passed", "kept"))
         episodes = self.task.scoring_seeds
-        self._record(scores={"episodes": len(episodes), "seeds_from": episodes.start, "commit": str(commit())})
-        log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass")
+        counts = {"episodes": len(episodes), "yardstick_episodes": len(episodes[: self.yardstick_episodes])}
+        self._record(scores={**counts, "seeds_from": episodes.start, "commit": str(commit())})
+        log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass, {kept:,} are kept")
+
+    @property
+    def _sizes(self) -> tuple[int, int]:
+        return self.task.inputs, self.task.outputs
 
     def _ghn(self, seed: int) -> Path:
         return self.work / "ghns" / f"{seed:03d}.safetensors"
@@ -213,13 +237,15 @@ class RobotBuilder(Builder):
     """Trains an expert, gathers the states that its students meet, and distils it into GHNs."""
 
     stages = ("expert", "states", "ghns", "scores", "pack")
+    analyses = ("twins",)
+    yardstick_episodes = 16
 
     def __init__(
         self, task: RobotPolicyTask, work: Path, seeds: int, workers: int, parallel: Backend = "processes"
     ) -> None:
         super().__init__(task, work, seeds, workers, parallel)
         self.task: RobotPolicyTask = task
-        self.expert_config, self.distill_config = ExpertConfig(), DistillConfig()
+        self.expert_config, self.distill_config, self.twins_config = ExpertConfig(), DistillConfig(), TwinsConfig()
 
     def expert(self) -> None:
         """Train the expert, then fix the task's standardisation from the states that it visits."""
@@ -257,6 +283,40 @@ class RobotBuilder(Builder):
         train = partial(distill.train_ghn, self.task, self.distill_config, self._expert(), self._states)
         return train, {**self.distill_config.model_dump(), "states": self._count_states()}
 
+    def twins(self) -> None:
+        """Train and measure NNiT's twin populations; the networks, too large to ship, stay in the work folder."""
+        if not self._states.exists():
+            raise UserError(f"{self.task.name} has no states to learn from; run the stage 'states' first")
+        config, folder = self.twins_config, self.work / "twins"
+        seeds = range(config.networks)
+        paths = {kind: [folder / kind / f"{seed:03d}.safetensors" for seed in seeds] for kind in twins.KINDS}
+        missing = [(path, kind) for kind in twins.KINDS for path in paths[kind] if not path.exists()]
+        train = partial(twins.train, self.task, config, self._expert(), self._states)
+        with Display(quiet=False).stage("twins", len(missing)) as advance:
+            for _, line in unordered(lambda unit: train(*unit), missing, self.workers):
+                log(f"twins: {line}")
+                advance(1)
+        observations, populations = self.task.probe_states(), {}
+        assert observations is not None
+        with Display(quiet=False).stage(
+            "twins: episodes", len(paths) * len(seeds) * len(self.task.scoring_seeds)
+        ) as advance:
+            for kind in twins.KINDS:
+                networks = twins.load(self.task, paths[kind])
+                scores = self._evaluate(networks, self.task.scoring_seeds, folder / "units", advance)
+                populations[kind] = stats.population(networks, scores, observations)
+        content = {
+            "architecture": "-".join(map(str, twins.HIDDEN)),
+            "populations": populations,
+            "episodes": len(self.task.scoring_seeds),
+            "seeds_from": self.task.scoring_seeds.start,
+            "config": config.model_dump(),
+            "commit": str(commit()),
+        }
+        write_json(self.data / stats.TWINS, content)
+        shutil.rmtree(folder / "units", ignore_errors=True)
+        log(f"twins: {json.dumps(populations)}")
+
     @property
     def _states(self) -> Path:
         return self.work / "states" / "states.safetensors"
@@ -276,9 +336,11 @@ class MNISTBuilder(Builder):
 
     stages = ("features", "ghns", "scores", "pack")
 
-    def __init__(self, task: MNISTPCA32, work: Path, seeds: int, workers: int, source: str | None = None) -> None:
-        super().__init__(task, work, seeds, workers)
-        self.source = source
+    source: str | None = None
+    """Where the digits of `features` come from."""
+
+    def __init__(self, task: MNISTPCA32, work: Path, seeds: int, workers: int, parallel: Backend = "processes") -> None:
+        super().__init__(task, work, seeds, workers, parallel)
         self.config = mnist.MNISTConfig()
 
     def features(self) -> None:
@@ -300,6 +362,11 @@ class MNISTBuilder(Builder):
         return partial(mnist.train_ghn, self.config), {**self.config.model_dump(), "digits": 60_000}
 
 
+def is_yardstick(split: str, ghn_seed: int) -> bool:
+    """Whether a policy of this split's architectures is for comparison only, and so never in the corpus."""
+    return split != "seen" or ghn_seed >= HELDOUT_SEEDS_FROM
+
+
 def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Iterator[dict[str, Any]]:
     """The selection rows of one architecture's candidates, by GHN seed.
 
@@ -312,7 +379,7 @@ def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Itera
     candidates = sorted(
         means.to_pylist(), key=lambda row: (*(-row[f"{column}_mean"] for column in task.thresholds), row["ghn_seed"])
     )
-    reference = [row["ghn_seed"] for row in candidates if split != "seen" or row["ghn_seed"] >= HELDOUT_SEEDS_FROM]
+    reference = [row["ghn_seed"] for row in candidates if is_yardstick(split, row["ghn_seed"])]
     passing = [
         row["ghn_seed"]
         for row in candidates
@@ -327,5 +394,6 @@ def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Itera
             "split": split,
             **{column: row[f"{column}_mean"] for column in columns},
             "episodes": row["seed_count"],
+            "passed": row["ghn_seed"] in passing,
             "kept": row["ghn_seed"] in kept,
         }

@@ -11,6 +11,7 @@ import torch
 from nnit_zoo.sim.rollout import Start, State, length
 from nnit_zoo.sim.tabletop import Array, Cube
 from nnit_zoo.tasks import draws
+from nnit_zoo.tasks.layouts import LAYOUTS
 from nnit_zoo.tasks.robot import RobotPolicyTask
 
 _HALF_SIZE = 0.02
@@ -26,7 +27,7 @@ class PushCube(RobotPolicyTask):
 
     name = "PushCube-v1"
     version = 1
-    layout: ClassVar = {"qpos": 9, "qvel": 9, "tcp_pose": 7, "goal_pos": 3, "obj_pose": 7}
+    layout: ClassVar = LAYOUTS[name]
     thresholds: ClassVar = {"success_at_end": 0.9, "return": 35.0}
 
     def start(self, seed: int) -> Start:

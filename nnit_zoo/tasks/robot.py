@@ -23,7 +23,7 @@ from nnit_zoo.sim import stock
 from nnit_zoo.sim.control import Controller, padded_shape
 from nnit_zoo.sim.rollout import ACTIONS, Start, State, rollout
 from nnit_zoo.sim.tabletop import Array, require_simulator
-from nnit_zoo.tasks.task import EPISODE_SCHEMA, Metric, Simulator, Task
+from nnit_zoo.tasks.task import Metric, Simulator, Task, episode_table
 
 # Episodes in lockstep, which are a unit of work. More of `fast` gain nothing and leave the cache; stock ManiSkill plays
 # one at a time on a CPU.
@@ -93,20 +93,15 @@ class RobotPolicyTask(Task):
         """One row of EPISODE_SCHEMA per policy and seed: a function of task, simulator, weights and seed alone."""
         self.check(policies, seeds)
         self.check_installed()
-        names = [str(batch.architecture) for batch in policies for _ in range(len(batch))]
         finite = np.concatenate([batch.finite().numpy() for batch in policies])
-        count = len(seeds)
+        count = len(finite) * len(seeds)
         table = {
-            "policy": np.repeat(np.arange(len(names), dtype=np.int32), count),
-            "architecture": np.repeat(names, count),
-            "seed": np.tile(np.asarray(seeds, np.int64), len(names)),
-            "return": np.zeros(len(names) * count, np.float32),
-            "success_once": np.zeros(len(names) * count, bool),
-            "success_at_end": np.zeros(len(names) * count, bool),
-            "reason": np.repeat([None if whole else "not finite" for whole in finite], count),
+            "return": np.zeros(count, np.float32),
+            "success_once": np.zeros(count, bool),
+            "success_at_end": np.zeros(count, bool),
         }
         if progress:
-            progress(int((~finite).sum()) * count)
+            progress(int((~finite).sum()) * len(seeds))
         units = _units(policies, finite, seeds, SCENES[self.simulator])
         for unit, scores in _scored(self, units, workers, parallel, store):
             rows = [job.row for job in unit]
@@ -114,9 +109,7 @@ class RobotPolicyTask(Task):
                 table[name][rows] = values
             if progress:
                 progress(len(unit))
-        return pa.table(
-            {name: pa.array(table[name], field.type) for name, field in zip(table, EPISODE_SCHEMA, strict=True)}
-        )
+        return episode_table(policies, seeds, table)
 
 
 class _Job(NamedTuple):

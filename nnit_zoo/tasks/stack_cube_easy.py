@@ -15,7 +15,7 @@ import torch
 from nnit_zoo.sim.rollout import Start, State, length
 from nnit_zoo.sim.tabletop import Array, Cube
 from nnit_zoo.tasks import draws
-from nnit_zoo.tasks.pick_cube import PickCube
+from nnit_zoo.tasks.layouts import LAYOUTS
 from nnit_zoo.tasks.robot import RobotPolicyTask
 
 _HALF_SIZE = 0.02
@@ -30,7 +30,7 @@ class StackCubeEasy(RobotPolicyTask):
 
     name = "StackCubeEasy-v1"
     version = 1
-    layout: ClassVar = PickCube.layout
+    layout: ClassVar = LAYOUTS[name]
     thresholds: ClassVar = {"success_at_end": 0.8, "return": 30.0}
 
     def start(self, seed: int) -> Start:

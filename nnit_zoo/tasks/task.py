@@ -52,6 +52,24 @@ class Metric:
     unit: Literal["%", ""]
 
 
+def episode_table(
+    policies: Sequence[PolicyBatch], seeds: Sequence[int], scores: Mapping[str, npt.NDArray[Any]]
+) -> pa.Table:
+    """The rows of EPISODE_SCHEMA with these scores, each [policies * seeds] or [policies, seeds]; others are null."""
+    names = [str(batch.architecture) for batch in policies for _ in range(len(batch))]
+    reasons = [None if whole else "not finite" for batch in policies for whole in batch.finite().tolist()]
+    columns = {
+        "policy": np.repeat(np.arange(len(names)), len(seeds)),
+        "architecture": np.repeat(names, len(seeds)),
+        "seed": np.tile(np.asarray(seeds, np.int64), len(names)),
+        "reason": np.repeat(np.array(reasons, object), len(seeds)),
+        **{name: values.ravel() for name, values in scores.items()},
+    }
+    empty = [None] * (len(names) * len(seeds))
+    arrays = [pa.array(columns.get(field.name, empty), field.type) for field in EPISODE_SCHEMA]
+    return pa.Table.from_arrays(arrays, schema=EPISODE_SCHEMA)
+
+
 def data_folder(task: str) -> Path:
     """The folder of the package that holds what is shipped of a task."""
     return Path(__file__).parents[1] / "data" / task

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -13,13 +15,14 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from nnit_zoo import tasks
+from nnit_zoo import stats, tasks
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.build import distill, expert, mnist, stages
+from nnit_zoo.build import distill, expert, mnist, stages, twins
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.fit import Fit
 from nnit_zoo.build.ghn import GHN
+from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.cli import main
 from nnit_zoo.errors import UserError
 from nnit_zoo.materialise import materialise
@@ -27,6 +30,7 @@ from nnit_zoo.tasks import task as task_module
 from nnit_zoo.tasks.mnist import MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
 from nnit_zoo.tasks.task import data_folder
+from nnit_zoo.verify import rescore
 from nnit_zoo.zoo import Zoo
 
 TINY_EXPERT = ExpertConfig(total_steps=200, environments=2, hidden=16, epochs=1, minibatch=50, evaluate_every=1)
@@ -144,6 +148,22 @@ def test_a_killed_build_of_mnist_ends_with_the_same_bytes_and_a_zoo_with_accurac
     assert record["build"]["ghns"]["steps"] == 3 and record["build"]["features"]["train"] == 60_000
 
 
+def test_networks_for_digits_are_scored_where_the_user_says(builder, tmp_path, monkeypatch):
+    asked, evaluate = [], MNISTPCA32.evaluate
+
+    def note(task, policies, seeds, *, workers, parallel, store, progress):
+        asked.append((workers, parallel))
+        return evaluate(task, policies, seeds, workers=1, store=store, progress=progress)
+
+    monkeypatch.setattr(MNISTPCA32, "evaluate", note)
+    monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
+    builder(tmp_path, "MNIST-PCA32")  # gives the command below the toy's folder and architectures
+    options = {"task": "MNIST-PCA32", "seeds": 1, "work": tmp_path}
+    stages.build(stage="ghns", workers=1, **options)
+    stages.build(stage="scores", workers=3, parallel="ray", **options)
+    assert asked == [(3, "ray")] * 4
+
+
 def test_features_are_made_from_the_named_source_and_keep_the_record_of_the_zoo(builder, tmp_path):
     sample = Path(__file__).parents[1] / "zoo" / "mnist"
     built = builder(tmp_path, "MNIST-PCA32")
@@ -195,6 +215,98 @@ def test_a_stage_without_the_one_before_says_which_to_run(builder, tmp_path):
         builder(tmp_path).pack()
 
 
+def test_twins_learn_the_same_from_seeds_of_their_own_and_go_on_after_a_kill(builder, tmp_path, monkeypatch):
+    def prepare(folder):
+        built = builder(folder)
+        built.twins_config = TwinsConfig(networks=2, steps=3, sgd_steps=3, states_per_architecture=8)
+        if not (folder / "work" / "states").exists():
+            built.expert()
+            built.states()
+        return built
+
+    monkeypatch.setattr(twins, "HIDDEN", (64, 64, 64))
+    with pytest.raises(UserError, match="stage 'states' first"):
+        builder(tmp_path / "none").twins()
+    prepare(tmp_path / "whole").twins()
+    networks = {path.parent.name + path.stem: path.read_bytes() for path in tmp_path.glob("whole/work/twins/*/*")}
+    assert len(set(networks.values())) == 4 and set(networks) == {"GHN000", "GHN001", "SGD000", "SGD001"}
+    for module, name in ((twins, "train"), (PickCube, "evaluate")):
+        with monkeypatch.context() as killing:
+            kill_second_call(killing, module, name)
+            with pytest.raises(KeyboardInterrupt):
+                prepare(tmp_path / "killed").twins()
+    prepare(tmp_path / "killed").twins()
+    made = [(tmp_path / name / "data" / "twins.json").read_bytes() for name in ("whole", "killed")]
+    assert made[0] == made[1]
+    content = json.loads(made[0])
+    assert content["config"]["networks"] == 2 and content["episodes"] == 2
+    assert content["populations"].keys() == {"GHN", "SGD"}
+    for measures in content["populations"].values():
+        assert set(stats.PAPER_TWINS["PickCube-v1"]) <= set(measures)
+
+
+def test_a_wide_canvas_is_made_by_more_blocks_and_fills_wide_layers():
+    ghn = GHN(42, 8, seed=0, widths=(256,), layers=4)
+    wide = ghn.emit(Architecture(42, (256, 256, 256), 8))
+    assert ghn.canvas == 256 and [tuple(layer.shape[1:]) for layer in wide.layers][1] == (256, 257)
+    raw = wide.layers[1][0, :, :-1] * 256**0.5
+    assert raw.std() == pytest.approx(0.6, rel=0.2) and (raw.std(0) > 0.01).all()
+    assert {f"up{number}.weight" for number in range(1, 6)} <= set(ghn.state_dict())
+    assert "up4.weight" not in GHN(42, 8, seed=0).state_dict()
+    with pytest.raises(UserError, match="up to 64 wide, not 65 inputs"):
+        GHN(65, 8, seed=0)
+
+
+def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_path, monkeypatch):
+    monkeypatch.setattr(stages, "HELDOUT_SEEDS_FROM", 1)
+    monkeypatch.setattr(stages.RobotBuilder, "yardstick_episodes", 1)
+    built = builder(tmp_path)
+    run_all(built)
+    rows = pq.read_table(tmp_path / "data" / "selection.parquet").to_pylist()
+    played = {(row["architecture"], row["ghn_seed"]): row["episodes"] for row in rows}
+    assert played == {
+        (architecture, seed): 2 if split == "seen" and seed == 0 else 1
+        for split, listed in FEW.items()
+        for architecture in listed
+        for seed in (0, 1)
+    }
+    scores = pq.read_table(tmp_path / "data" / "scores.parquet").to_pylist()
+    first = [(row["ghn_seed"], row["seed"]) for row in scores if row["architecture"] == FEW["seen"][0]]
+    assert first == [(0, 0), (0, 1), (1, 0)]
+
+    monkeypatch.setattr(PickCube, "evaluate", None)
+    builder(tmp_path).scores()  # nothing is missing
+    monkeypatch.undo()
+
+    monkeypatch.setattr(tasks, "get", lambda name: built.task)
+    monkeypatch.setattr(PickCube, "scoring_seeds", range(2))
+    materialise(tmp_path / "data", tmp_path / "zoo")
+    episodes = []
+    rescored = rescore(tmp_path / "zoo", 9, episodes.append)
+    assert all(row["agrees"] and row["now_return"] == row["stored_return"] for row in rescored)
+    assert sum(episodes) == len(rescored) == 6  # of seed 1, and seed 0's of the other two architectures
+
+
+def test_a_worker_that_dies_costs_the_buffer_nothing(tmp_path):
+    class Deadly(PickCube):  # here, so that worker processes get it whole
+        episode_steps = 2
+
+        def start(self, seed):
+            if (tmp_path / "deadly").exists():
+                (tmp_path / "deadly").unlink()
+                os.kill(os.getpid(), signal.SIGKILL)
+            return super().start(seed)
+
+    config = DistillConfig(rounds=2, episodes_per_round=51, round_steps=2)
+    network = expert.network_of(expert.ActorCritic(42, 8, 16, -0.5).actor)
+    distill.gather_states(Deadly(), config, network, tmp_path / "alone", 1, print)
+    (tmp_path / "deadly").touch()
+    distill.gather_states(Deadly(), config, network, tmp_path / "killed", 2, print)
+    assert not (tmp_path / "deadly").exists()
+    whole, killed = (tmp_path / name / "states.safetensors" for name in ("alone", "killed"))
+    assert killed.read_bytes() == whole.read_bytes()
+
+
 def test_scores_of_other_seeds_are_made_again(builder, tmp_path):
     run_all(builder(tmp_path, "MNIST-PCA32"))
     more = builder(tmp_path, "MNIST-PCA32")
@@ -221,12 +333,13 @@ def test_selection_keeps_the_best_that_reach_both_thresholds():
     task = tasks.get("PickCube-v1")
     scores = scores_of([(0.9, 36.0), (1.0, 34.0), (0.8, 40.0), (1.0, 35.0)])
     rows = list(stages.select(task, "seen", "x", scores))
-    assert [row["kept"] for row in rows] == [True, False, False, True]
+    assert [row["kept"] for row in rows] == [row["passed"] for row in rows] == [True, False, False, True]
     assert [row["success_at_end"] for row in rows] == [0.9, 1.0, 0.8, 1.0]
     assert all(row["kept"] for row in stages.select(task, "unseen", "x", scores))
 
     many = scores_of([(0.9 + 0.1 * (seed % 2), 36.0) for seed in range(120)])
     kept = [row["ghn_seed"] for row in stages.select(task, "seen", "x", many) if row["kept"]]
+    assert all(row["passed"] for row in stages.select(task, "seen", "x", many))
     assert len(kept) == 100 and set(range(1, 120, 2)) <= set(kept)
 
 

@@ -13,7 +13,7 @@ import torch
 from nnit_zoo import parallel, tasks
 from nnit_zoo.architecture import architectures
 from nnit_zoo.errors import UserError
-from nnit_zoo.parallel import unordered
+from nnit_zoo.parallel import in_chunks, unordered
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.tasks import robot
 
@@ -69,6 +69,12 @@ def test_a_unit_that_kills_every_time_is_named(backend, tmp_path):
         for number, _ in unordered(work, range(12), 2, backend):
             finished.append(number)
     assert set(range(4)) <= set(finished)
+
+
+def test_chunks_keep_their_order_whoever_dies(tmp_path):
+    work = square_or_die(tmp_path, deadly=0, lives=1)
+    results = in_chunks(lambda chunk: (work(chunk.start), len(chunk)), range(8), 3, 2)
+    assert results == [(0, 3), (9, 3), (36, 2)]
 
 
 def test_an_error_in_the_work_is_the_callers(backend):

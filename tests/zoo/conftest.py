@@ -48,6 +48,7 @@ def make_data_folder(folder: Path, task: str = "PickCube-v1", inputs: int = 42, 
             "success_at_end": 0.75 + seed / 512 if robot else None,
             "return": 38.0 if robot else 0.96,
             "episodes": 64,
+            "passed": (architecture, seed) != DROPPED,
             "kept": (architecture, seed) != DROPPED,
         }
         for seed in SEEDS

@@ -55,14 +55,28 @@ def in_its_own_process(*arguments: str) -> Result:
     return result.returncode, result.stdout, result.stderr
 
 
+def imported(stderr: str) -> set[str]:
+    """The packages that a process of `in_its_own_process` has imported."""
+    return {line.rpartition("|")[2].strip().partition(".")[0] for line in stderr.splitlines()}
+
+
 @pytest.mark.parametrize(("option", "expected"), [("--help", "download"), ("--version", version("nnit"))])
 def test_help_and_version_import_nothing_heavy(option: str, expected: str) -> None:
     code, stdout, stderr = in_its_own_process(option)
     assert code == 0
     assert expected in stdout
-    imported = {line.rpartition("|")[2].strip().partition(".")[0] for line in stderr.splitlines()}
-    assert "cyclopts" in imported
-    assert not imported & {"torch", "numpy", "pyarrow", "mani_skill", "sapien", "huggingface_hub", "pydantic"}
+    assert "cyclopts" in imported(stderr)
+    assert not imported(stderr) & {"torch", "numpy", "pyarrow", "mani_skill", "sapien", "huggingface_hub", "pydantic"}
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [("list", "training policies"), ("show", "is_grasped"), ("download --dry-run", "files to write")],
+)
+def test_looking_needs_no_torch(command: str, expected: str) -> None:
+    code, stdout, stderr = in_its_own_process(*command.split())
+    assert code == 0 and expected in stdout
+    assert "pyarrow" in imported(stderr) and "torch" not in imported(stderr)
 
 
 @pytest.mark.parametrize("arguments", [("download", "--task", "NoSuchTask"), ("download", "--fodler", "x")])
@@ -81,7 +95,9 @@ def test_list_and_show_need_no_download(nnit_zoo: Command) -> None:
     shown = json.loads(nnit_zoo("show", "PickCube-v1", "--json")[1])
     assert shown == zoo | {"layout": shown["layout"]}
     assert shown["layout"]["obj_pose"] == "29-35"
-    assert "heldout_seed" in nnit_zoo("show")[1]
+    assert shown["pass_rates"] == {"32-16-64-32": 1.0, "64-64-64-32": 0.5}
+    table = nnit_zoo("show")[1]
+    assert "heldout_seed" in table and "75.0% pass the thresholds; fewest of 64-64-64-32: 50.0%" in table
     policies = json.loads(nnit_zoo("show", "--architecture", "64-64-64-32", "--json")[1])
     assert [policy["id"] for policy in policies] == ["PickCube-v1/64-64-64-32/000", "PickCube-v1/64-64-64-32/128"]
 
@@ -154,7 +170,7 @@ def test_stats_are_printed_beside_the_papers_numbers(nnit_zoo: Command, tmp_path
     options = ("--architecture", "32-16-64-32", "--output", str(tmp_path / "figures"))
     code, stdout, stderr = nnit_zoo("stats", *options, "--json")
     assert code == 0, stderr
-    rows = {row["measure"]: row for row in json.loads(stdout)}
+    rows = {row["measure"]: row for row in json.loads(stdout)["zoo"]}
     zoo = Zoo.open(files.default_folder("PickCube-v1"))
     batch = zoo.batch("32-16-64-32", "seen")
     expected = (batch.flat()[0].double() - batch.flat()[1].double()).norm()

@@ -61,6 +61,23 @@ def test_other_machines_and_thread_counts_give_the_same_bytes(
     assert hashes(tmp_path / "again") == hashes(data_folder)
 
 
+def test_the_index_says_how_large_a_policy_is_and_its_weights(made_once: Path) -> None:
+    for policy in Zoo.open(made_once):
+        flat = policy.weights.flat().double().numpy()[0]
+        assert policy.record["n_params"] == flat.size
+        assert policy.record["weight_norm"] == pytest.approx(np.linalg.norm(flat), rel=1e-7)
+
+
+def test_an_index_of_before_these_columns_is_still_read(zoo_folder: Path) -> None:
+    manifest = Manifest.read(zoo_folder)
+    older = files.read_index(zoo_folder / files.INDEX).drop_columns(["n_params", "weight_norm"])
+    pq.write_table(older, zoo_folder / files.INDEX)
+    manifest.index = Entry.of((zoo_folder / files.INDEX).read_bytes())
+    (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
+    assert verify(zoo_folder) == []
+    assert Zoo.open(zoo_folder).index["weight_norm"].null_count == len(older)
+
+
 def test_two_processes_at_once_leave_one_sound_zoo(data_folder: Path, zoo_folder: Path, tmp_path: Path) -> None:
     in_another_process(data_folder, tmp_path / "shared", 1, "twice")
     assert hashes(tmp_path / "shared") == hashes(zoo_folder)

@@ -19,6 +19,7 @@ from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
 from nnit_zoo.materialise import stored
 from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.tasks import mnist as mnist_task
 from nnit_zoo.tasks.mnist import FEATURES
 from nnit_zoo.tasks.task import data_folder
 
@@ -144,6 +145,16 @@ def test_a_policy_scores_the_same_in_any_company_and_order() -> None:
     assert {**backward[0], "policy": 2} == table[2 * 100 + 7]
     assert {**backward[-1], "policy": 1} == table[1 * 100 + 3]
     assert len({row["return"] for row in table}) > 5
+
+
+def test_several_processes_give_the_same_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = TASK.evaluate(policies(2), range(100), workers=1)
+    monkeypatch.setattr(mnist_task, "UNIT", 1)
+    done: list[int] = []
+    assert TASK.evaluate(policies(2), range(100), workers=2, progress=done.append).equals(alone)
+    assert done == [100] * 4
+    with pytest.raises(UserError, match="1 worker or more"):
+        TASK.evaluate(policies(1), [1], workers=0)
 
 
 def test_a_policy_that_is_not_finite_or_huge_stops_nothing() -> None:

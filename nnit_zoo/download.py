@@ -1,0 +1,73 @@
+"""Bring a task's zoo to this machine: from a source, or made from the GHNs that nnit embeds, with the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+
+import pyarrow as pa
+
+from nnit_zoo import files
+from nnit_zoo.display import Display
+from nnit_zoo.errors import UserError
+from nnit_zoo.files import INDEX, MANIFEST, SPLITS, Entry, Manifest, Progress
+
+
+class Download:
+    """A zoo and the folder that it goes to, by default the task's usual one; nothing is written before `run`.
+
+    `source` is an address as of `nnit_zoo.hub.Source`; without one, the zoo is made from the embedded GHNs. Raises
+    UserError if there is no such zoo, or if a source's would take the place of this version's.
+    """
+
+    def __init__(
+        self, task: str, folder: Path | None = None, *, source: str | None = None, revision: str | None = None
+    ) -> None:
+        self.task = task
+        self.folder = files.default_folder(task) if folder is None else folder
+        self._verb = "fetching" if source else "making"
+        self._index: pa.Table
+        self._bring: Callable[[Path, Progress, Collection[str]], None]
+        if source is None:
+            if revision:
+                raise UserError("--revision says which version of a --source: give both")
+            embedded = files.embedded(task)
+            self.manifest, self._index = Manifest.read(embedded), files.read_index(embedded / INDEX)
+            self._bring = partial(_make, embedded)
+            return
+        from nnit_zoo.hub import Source  # noqa: PLC0415  most zoos come from no source
+
+        found = Source(source, task, revision)
+        if folder is None and found.manifest != Manifest.read(files.embedded(task)):
+            raise UserError(
+                f"{source} holds another version of the zoo than this nnit; keep it elsewhere with --folder"
+            )
+        self.manifest, self._index, self._bring = found.manifest, files.read_index(BytesIO(found.index)), found.fetch
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder holds this version of the zoo, whole or in part; its files are not looked at."""
+        path = self.folder / MANIFEST
+        return path.is_file() and path.read_bytes() == self.manifest.to_bytes()
+
+    def wanted(self, splits: Collection[str] = SPLITS) -> set[str]:
+        """The files that these splits need; raises UserError for an unknown split."""
+        return files.shards_of(self._index, splits) | {INDEX}
+
+    def missing(self, splits: Collection[str] = SPLITS) -> dict[str, Entry]:
+        """Of the wanted files, those that the folder lacks or holds in another form."""
+        return self.manifest.missing(self.folder, self.wanted(splits))
+
+    def run(self, screen: Display, splits: Collection[str] = SPLITS) -> None:
+        """Write what is missing, as `files.fill` does, and show how far it is."""
+        shards = len(files.shards_of(self._index, splits))
+        with screen.stage(f"{self._verb} {self.task}", shards) as progress:
+            self._bring(self.folder, progress, splits)
+
+
+def _make(embedded: Path, target: Path, progress: Progress, splits: Collection[str]) -> None:
+    from nnit_zoo.materialise import materialise  # noqa: PLC0415  imports torch, which a dry run does not need
+
+    materialise(embedded, target, progress, splits)
