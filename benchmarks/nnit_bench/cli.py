@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -27,8 +29,7 @@ app = App(
     version=lambda: version("nnit"),
     default_parameter=Parameter(negative=""),
 )
-
-
+app.register_install_completion_command(help="Set up completion in your shell.")
 app.command("nnit_bench.compare:compare", name="compare", help="Say whether two methods can be told apart.")
 app.command("nnit_bench.check:check", name="check", help="Say whether a method keeps to the contract of a generator.")
 app.command("nnit_bench.report:report", name="report", help="Write all stored results as tables and figures.")
@@ -177,6 +178,7 @@ def train(
     steps: int | None = None,
     seed: int = 0,
     output: Path | None = None,
+    trackio: str | None = None,
     quiet: bool = False,
 ) -> None:
     """Train a method on a task's zoo and write its checkpoint; after an interruption, the same command goes on.
@@ -188,6 +190,7 @@ def train(
         steps: Optimiser steps, instead of the method's own number.
         seed: Seed of the training.
         output: Folder of the checkpoint; by default runs/METHOD/TASK.
+        trackio: Project of trackio that the training's log also goes to, live; needs the extra `trackio`.
         quiet: Print no progress and no notes.
     """
     from nnit_baselines import generator, training
@@ -200,8 +203,9 @@ def train(
     folder = output or Path("runs") / folder_name(method) / task
     screen = Display(quiet)
     zoo = _zoo(task, screen)
-    with screen.steps(f"training {method}") as progress:
-        settings = generator.Run(steps=steps, seed=seed, folder=folder / "state", progress=progress)
+    name = f"{folder_name(method)}-{task}-{seed}"
+    with _tracking(trackio, name) as track, screen.steps(f"training {method}") as progress:
+        settings = generator.Run(steps=steps, seed=seed, folder=folder / "state", progress=progress, track=track)
         training.train(method, task, settings, folder, zoo.folder, preset)
     sys.stdout.write(f"{folder}\n")
     screen.note(f"score it with: nnit-bench run --method {method} --task {task} --checkpoint {folder}")
@@ -264,6 +268,25 @@ def main() -> None:
     run_application(app)
 
 
+@contextmanager
+def _tracking(project: str | None, name: str) -> Iterator[Callable[[dict[str, float]], None] | None]:
+    """What takes a line of a training's log to the run `name` of a trackio project, which goes on if it is there."""
+    if project is None:
+        yield None
+        return
+    try:
+        import trackio
+    except ImportError:
+        raise UserError("--trackio needs trackio; install it with: pip install 'nnit[trackio]'") from None
+    with redirect_stdout(sys.stderr):  # where trackio talks; ours is for data
+        trackio.init(project=project, name=name, resume="allow")
+    try:
+        yield lambda line: trackio.log({key: value for key, value in line.items() if key != "step"}, int(line["step"]))
+    finally:
+        with redirect_stdout(sys.stderr):
+            trackio.finish()
+
+
 def _names(texts: tuple[str, ...]) -> list[str]:
     """The names in an option that may be repeated and may hold commas."""
     return [name for text in texts for name in text.split(",") if name]
@@ -296,15 +319,12 @@ def _task(name: str, simulator: Simulator) -> Task:
 def _zoo(task: str, screen: Display) -> Zoo:
     """The task's zoo in its usual folder; made there first if it is not there, or is another version's."""
     import nnit_zoo
-    from nnit_zoo import files
-    from nnit_zoo.materialise import materialise
+    from nnit_zoo.download import Download
 
-    source, target = files.embedded(task), files.default_folder(task)
-    promised, found = source / files.MANIFEST, target / files.MANIFEST
-    if not found.is_file() or found.read_bytes() != promised.read_bytes():
-        screen.note(f"making the zoo of {task} in {target}, as nnit-zoo download does")
-        with screen.stage("shards", len(files.Manifest.read(source).shards)) as advance:
-            materialise(source, target, advance)
+    zoo = Download(task)
+    if not zoo.is_there:
+        screen.note(f"making the zoo of {task} in {zoo.folder}, as nnit-zoo download does")
+        zoo.run(screen)
     return nnit_zoo.load(task)
 
 

@@ -94,8 +94,8 @@ class Table:
     title: str
     columns: tuple[str, ...]
     rows: list[Row] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    """Commands that would fill our empty cells, or why they stay empty."""
+    notes: list[str] = field(default_factory=list)
+    """Commands that would fill our empty cells, or why they stay empty; and which cells are of shipped runs."""
 
 
 def reproduce(*, table: Name = "main", folders: Folders = FOLDERS, as_json: Json = False) -> None:
@@ -123,7 +123,7 @@ def reproduce(*, table: Name = "main", folders: Folders = FOLDERS, as_json: Json
         console.print(f"{each.title}\n")
         console.print(shown)
         console.print()
-    for line in dict.fromkeys(line for each in made for line in each.missing):
+    for line in dict.fromkeys(line for each in made for line in each.notes):
         console.print(line, soft_wrap=True)
 
 
@@ -236,11 +236,13 @@ def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> Store
     if run is None:
         there = METHODS[name] in _methods()
         make = f"missing: {results.command(METHODS[name], task, split)}"
-        table.missing.append(make if there else f"missing: {name} is not in this version of nnit")
+        table.notes.append(make if there else f"missing: {name} is not in this version of nnit")
     elif run.record.results is None:
-        table.missing.append(f"unsupported: {name} on {task}, {split}: {run.record.error}")
+        table.notes.append(f"unsupported: {name} on {task}, {split}: {run.record.error}")
     elif not run.is_whole:
-        table.missing.append(f"in part: the run of {name} on {task}, {split} has not all policies of the protocol")
+        table.notes.append(f"in part: the run of {name} on {task}, {split} has not all policies of the protocol")
+    if run and run.is_shipped:
+        table.notes.append(f"shipped, not run here: {name} on {task}, {split}")
     return run
 
 

@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from nnit_zoo.tasks.task import Task
 
 Split = Literal["unseen", "seen", "excluded", "joint", "offgrid", "wide", "deep", "shallow"]
+"""The lists of architectures that a run may be on."""
 SPLITS: tuple[Split, ...] = get_args(Split)
+"""Their names, in the order in which reports show them."""
 ANY = "any"
 """The key of `Protocol.policies` on the split `joint`, where the generator chooses the architectures."""
 
-# Architectures beyond the zoo's grid (not in the paper): other widths, larger widths, other depths.
 EXTENSIONS: dict[str, tuple[str, ...]] = {
     "offgrid": (
         "24-24-24-24", "40-40-40-40", "24-32-40-64", "40-16-48-32",
@@ -40,30 +41,36 @@ EXTENSIONS: dict[str, tuple[str, ...]] = {
         "32-64-32", "64-16-64", "16-16-64", "16-64-32",
     ),
 }  # fmt: skip
+"""Architectures beyond the zoo's grid (not in the paper): other widths, larger widths, other depths."""
 
-# Policies generated in all, spread evenly over the split's architectures (NNiT tables 2, 3 and 6, appendix J; the other
-# splits are not in the paper and follow `unseen`).
 POLICIES: dict[str, int] = {"unseen": 80, "seen": 100, "excluded": 90, "joint": 100}
+"""Policies generated in all, spread evenly over the split's architectures (NNiT tables 2, 3 and 6, appendix J)."""
 DEFAULT_POLICIES = 80
+"""The same for the other splits, which are not in the paper and follow `unseen`."""
 
 Selection = Literal["paper", "heldout"]
+"""How the best policies are scored, see `Protocol.selection`."""
 
 
-class Metric(BaseModel):
-    """A score of the task, and how people read it; the first of a protocol's is its headline."""
+class _Frozen(BaseModel):
+    """Settings that do not change; one that is not known is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+
+class Metric(_Frozen):
+    """A score of the task, and how people read it; the first of a protocol's is its headline."""
+
     column: Literal["return", "success_once", "success_at_end"]
+    """Its column in the table of episodes."""
     label: str
+    """Its name in tables."""
     unit: Literal["%", ""]
     """`%` for a share in [0, 1], which is shown times 100; empty for a number that is shown as it is."""
 
 
-class Episodes(BaseModel):
+class Episodes(_Frozen):
     """The episodes of a phase: `count` seeds from `first` on."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     first: int
     count: int
@@ -74,10 +81,8 @@ class Episodes(BaseModel):
         return range(self.first, self.first + self.count)
 
 
-class Protocol(BaseModel):
+class Protocol(_Frozen):
     """The settings of a run that every method shares."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     version: int = 1
     """Raised whenever the same settings come to mean something else."""

@@ -37,9 +37,7 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.files import sha256_of
 from nnit_zoo.provenance import commit
 
-EPISODES = "episodes.parquet"
-POLICIES = "policies.parquet"
-RECORD = "run.json"
+EPISODES, POLICIES, RECORD = "episodes.parquet", "policies.parquet", "run.json"
 EPISODE_SCHEMA = pa.schema(
     [
         ("method", pa.string()),
@@ -58,15 +56,21 @@ EPISODE_SCHEMA = pa.schema(
         ("reason", pa.string()),  # why a policy scored 0 without an episode
     ]
 )
+"""The columns of episodes.parquet."""
 OUR_PACKAGES = ("nnit_zoo", "nnit_baselines", "nnit_bench")
-# The packages whose versions can change a number; the record lists all that are installed.
+"""The packages whose source files are hashed into a run's id."""
 NUMERIC_PACKAGES = ("torch", "numpy", "mani_skill", "sapien")
+"""The packages whose versions can change a number; the record lists all that are installed."""
 
 
-class Method(BaseModel):
-    """The generator that was scored."""
+class _Strict(BaseModel):
+    """A part of run.json; a field that it does not know is an error."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+class Method(_Strict):
+    """The generator that was scored."""
 
     name: str
     config: dict[str, Any]
@@ -86,10 +90,8 @@ class Method(BaseModel):
         return self.name.rpartition("/")[2]
 
 
-class ZooVersion(BaseModel):
+class ZooVersion(_Strict):
     """The zoo that the generator learned from and is measured against."""
-
-    model_config = ConfigDict(extra="forbid")
 
     sha256: str
     """Of its manifest.json, which holds the hash of every shard."""
@@ -99,22 +101,19 @@ class ZooVersion(BaseModel):
     """Hypernetworks that these come from."""
 
 
-class Code(BaseModel):
+class Code(_Strict):
     """The code that ran."""
-
-    model_config = ConfigDict(extra="forbid")
 
     sha256: str
     """Of the source files of nnit_zoo, nnit_baselines and nnit_bench, and of a method given as a file."""
     commit: str | None
+    """The checkout's commit."""
     dirty: bool | None
     """Whether the checkout had changes that are not in `commit`; both are null outside a checkout."""
 
 
-class Hardware(BaseModel):
+class Hardware(_Strict):
     """The machine that ran it."""
-
-    model_config = ConfigDict(extra="forbid")
 
     machine: str
     processor: str
@@ -122,21 +121,20 @@ class Hardware(BaseModel):
     memory_gib: float
 
 
-class Timings(BaseModel):
+class Timings(_Strict):
     """Wall-clock seconds of a run's parts."""
 
-    model_config = ConfigDict(extra="forbid")
-
     load_or_fit: float
+    """Reading the method's checkpoint, or fitting it."""
     sample: float
     novelty: float
+    """Comparing the policies with the zoo's."""
     score: float
+    """Playing all episodes."""
 
 
-class Distance(BaseModel):
+class Distance(_Strict):
     """How far generated policies are from known ones, and how far policies of held-out seeds are."""
-
-    model_config = ConfigDict(extra="forbid")
 
     median: float
     """Over the generated policies: distance to the nearest known one."""
@@ -146,10 +144,8 @@ class Distance(BaseModel):
     """`median` / `heldout`: near 0 for copies, near 1 for policies as new as those of another seed."""
 
 
-class Novelty(BaseModel):
+class Novelty(_Strict):
     """Whether the generated policies are new; the distances of each are in policies.parquet."""
-
-    model_config = ConfigDict(extra="forbid")
 
     same_architecture: Distance | None
     """Relative L2 to the nearest policy of the same architecture by a corpus seed: a training policy on `seen`,
@@ -188,10 +184,8 @@ class Identity(BaseModel):
         return output / self.protocol.task / self.protocol.split / folder_name(self.method.name) / self.run_id
 
 
-class RunRecord(BaseModel):
+class RunRecord(_Strict):
     """The content of run.json."""
-
-    model_config = ConfigDict(extra="forbid")
 
     schema_version: Literal[1] = 1
     run_id: str
@@ -254,8 +248,8 @@ class RunRecord(BaseModel):
         novelty: Novelty,
     ) -> RunRecord:
         """Write the tables, then the record with status `success`; returns that record."""
-        for name, table in ((EPISODES, episodes.cast(EPISODE_SCHEMA)), (POLICIES, policies)):
-            _write(folder / name, lambda path, table=table: pq.write_table(table, path, compression="zstd"))  # type: ignore[misc]
+        _write_table(folder / EPISODES, episodes.cast(EPISODE_SCHEMA))
+        _write_table(folder / POLICIES, policies)
         return self._close(folder, status="success", timings=timings, results=results, novelty=novelty)
 
     def stop(self, folder: Path, status: Literal["failed", "unsupported"], reason: str) -> RunRecord:

@@ -30,6 +30,8 @@ Group = list[StoredRun]
 def report(*, folders: Folders = FOLDERS, output: Path = Path("report"), as_json: Json = False) -> None:
     """Write all stored results as tables and figures: of every method its newest whole run on each task and split.
 
+    Runs that ship with the project are among them, and marked.
+
     Args:
         folders: Folders to look for runs in; may be repeated.
         output: Folder to write report.md, report.json, report.csv and the figures to.
@@ -70,19 +72,21 @@ def _headline(run: StoredRun) -> Metric:
 
 
 def _plain(run: StoredRun) -> dict[str, Any]:
-    return {"folder": str(run.folder), **run.record.model_dump(mode="json", exclude={"packages"})}
+    record = run.record.model_dump(mode="json", exclude={"packages"})
+    return {"folder": str(run.folder), "shipped": run.is_shipped, **record}
 
 
 def _csv(groups: Sequence[Group]) -> str:
     """A line per estimate."""
     text = io.StringIO()
     lines = csv.writer(text, lineterminator="\n")
-    lines.writerow(["task", "split", "method", "run_id", "architecture", "metric", "statistic", "value", "low", "high"])
+    of_run = ["task", "split", "method", "run_id", "shipped"]
+    lines.writerow([*of_run, "architecture", "metric", "statistic", "value", "low", "high"])
     for run in (run for group in groups for run in group if run.record.results):
         found = run.record.results
         assert found is not None
         protocol = run.record.protocol
-        start = [protocol.task, protocol.split, run.record.method.name, run.record.run_id]
+        start = [protocol.task, protocol.split, run.record.method.name, run.record.run_id, run.is_shipped]
         for metric, statistics in found.estimates.items():
             for name, each in statistics.items():
                 place = found.worst if name == "worst" else ""
@@ -102,7 +106,8 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
         parts.append(
             f"Headline: {metric.label}{' in %' if metric.unit else ''}, with 95 % intervals. `tied`: cannot be told "
             "apart from the first row. `nearest known`: median distance (relative L2) to the nearest policy that a "
-            "known seed has for the architecture; in brackets as a multiple of that of held-out seeds.\n"
+            "known seed has for the architecture; in brackets as a multiple of that of held-out seeds. "
+            "`shipped`: run by the project, not here.\n"
         )
         heading = ["method", "mean", f"top-{protocol.top}", "held out", "worst architecture", "tied", "nearest known"]
         parts.append("| " + " | ".join(heading) + " |\n|---|" + "---:|" * (len(heading) - 1))
@@ -121,7 +126,7 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
 
 def _row(run: StoredRun, group: Group, metric: Metric) -> str:
     record = run.record
-    name = record.method.label + _size(run, group)
+    name = record.method.label + _size(run, group) + ", shipped" * run.is_shipped
     if record.results is None:
         return f"| {name} | {record.status}: {record.error} |" + " |" * 5
     numbers = record.results.estimates[metric.column]

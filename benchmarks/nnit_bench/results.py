@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -16,10 +17,16 @@ from nnit_bench.protocol import policies_per_architecture
 from nnit_bench.records import RECORD, RunRecord, read_episodes
 from nnit_zoo.errors import UserError, unknown_name
 
-FOLDERS = (Path("results"), Path("leaderboard/results"))
-"""Where runs are looked for: this machine's, and those that ship with the project."""
+SHIPPED = Path(__file__).resolve().parents[2] / "leaderboard" / "results"
+"""The runs that ship with the project, in a checkout; an installed package has none."""
+FOLDERS = (Path("results"), SHIPPED)
+"""Where runs are looked for: those made here, and those that ship with the project."""
 Folders = Annotated[
-    tuple[Path, ...], Parameter(name="--results", show_default=lambda paths: ", ".join(map(str, paths)))
+    tuple[Path, ...],
+    Parameter(
+        name="--results",
+        show_default=lambda paths: "results, and the project's" if paths == FOLDERS else ", ".join(map(str, paths)),
+    ),
 ]
 
 
@@ -34,6 +41,11 @@ class StoredRun:
     def episodes(self) -> pa.Table:
         """The run's episodes; raises UserError if they are missing or damaged."""
         return read_episodes(self.folder)
+
+    @property
+    def is_shipped(self) -> bool:
+        """Whether it ships with the project."""
+        return self.folder.resolve().is_relative_to(SHIPPED)
 
     @property
     def is_whole(self) -> bool:
@@ -57,8 +69,12 @@ def find(folders: Iterable[Path]) -> list[StoredRun]:
 
 
 def latest(runs: Iterable[StoredRun]) -> dict[tuple[str, str, str], StoredRun]:
-    """(task, split, method) -> the newest of its runs, one that is whole before one that is not."""
-    ranked = sorted(runs, key=lambda run: (run.is_whole, run.record.started))
+    """(task, split, method) -> its run: a whole one, of the most episodes, the newest, one's own, in this order."""
+
+    def rank(run: StoredRun) -> tuple[bool, int, datetime, bool]:
+        return run.is_whole, run.record.protocol.select.count, run.record.started, not run.is_shipped
+
+    ranked = sorted(runs, key=rank)
     return {(run.record.protocol.task, run.record.protocol.split, run.record.method.name): run for run in ranked}
 
 

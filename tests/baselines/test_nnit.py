@@ -201,11 +201,13 @@ def test_stopping_and_resuming_changes_nothing(settings, view, tmp_path, monkeyp
     with pytest.raises(KeyboardInterrupt):
         resumed.fit(view, Run(seed=3, folder=tmp_path, progress=stop))
     monkeypatch.setattr(training.Trainer, "save", save)
-    resumed.fit(view, Run(seed=3, folder=tmp_path))
+    tracked = []
+    resumed.fit(view, Run(seed=3, folder=tmp_path, track=tracked.append))
     assert all(torch.equal(value, resumed.tensors()[name]) for name, value in straight.tensors().items())
     lines = [json.loads(line) for line in (tmp_path / training.LOG).read_text().splitlines()]
     assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
     assert ["quality" in line for line in lines] == [False] * 5 + [True]
+    assert tracked == lines[2:]
 
 
 def test_another_seed_gives_another_model_and_refuses_the_state(view, tmp_path):

@@ -1,9 +1,11 @@
 """The `nnit-bench` command, from a fresh machine to the table, and the answers to mistakes."""
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -164,8 +166,48 @@ def test_a_damaged_shard_is_answered(
     assert "is missing or damaged; mend it with: nnit-zoo download --task Formula-v1" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("typed", "offered"), [("nnit-bench re", {"render", "report", "reproduce"}), ("run --met", {"--method"})]
+)
+def test_completion_is_installed_and_completes(
+    call: Call, typed: str, offered: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert call("--install-completion", "--shell", "bash") == 0
+    words = ["nnit-bench", *typed.removeprefix("nnit-bench ").split()]
+    ask = f"source ~/.bashrc; COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}"
+    ask += "; $(complete -p nnit-bench | sed 's/.*-F //; s/ .*//'); echo ${COMPREPLY[@]}"
+    answer = subprocess.run(["bash", "--norc", "-c", ask], capture_output=True, text=True, check=True)
+    assert set(answer.stdout.split()) == offered
+
+
 def test_list_names_methods_and_tasks(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("list", "--json") == 0
     listed = json.loads(capsys.readouterr().out)
     assert {"nnit", "crop", "ghn-oracle"} <= set(listed["methods"])
     assert "PickCube-v1" in listed["tasks"]
+
+
+def test_a_training_is_tracked_live(call: Call, fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against trackio's own names and arguments."""
+    calls: list[Any] = []
+
+    def init(project: str, name: str | None = None, resume: str = "never") -> None:
+        calls.append((project, name, resume))
+
+    def log(metrics: dict[str, float], step: int | None = None) -> None:
+        calls.append((step, metrics["loss"] > 0, "step" in metrics))
+
+    stand_in = SimpleNamespace(init=init, log=log, finish=lambda: calls.append("finish"))
+    monkeypatch.setitem(sys.modules, "trackio", stand_in)
+    what = ["train", "--task", "Formula-v1", "--steps", "1", "--output", tmp_path / "trained", "--trackio", "mine"]
+    assert call(*what) == 0
+    assert calls == [("mine", "nnit-Formula-v1-0", "allow"), (1, True, False), "finish"]
+
+
+def test_tracking_without_trackio_says_how_to_get_it(
+    call: Call, fresh: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "trackio", None)
+    assert call("train", "--task", "Formula-v1", "--trackio", "mine") == 2
+    assert "pip install 'nnit[trackio]'" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from nnit_bench import paper, results
-from nnit_bench.protocol import Metric, Protocol
+from nnit_bench.protocol import Episodes, Metric, Protocol
 from nnit_bench.report import report
 from nnit_bench.results import StoredRun
 from nnit_zoo.errors import UserError
+
+from .conftest import store_run
 
 Store = Callable[..., StoredRun]
 
@@ -50,6 +53,37 @@ def test_the_newest_whole_run_is_taken(store: Store, pick: Protocol) -> None:
     assert results.resolve("nnit", found, "PickCube-v1", "unseen").record.run_id == new.record.run_id
     by_folder = results.resolve(str(part_of_it.folder), found, "", "")
     assert by_folder.record.run_id == part_of_it.record.run_id
+
+
+def test_shipped_runs_are_marked_and_give_way_to_newer_ones(
+    pick: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped, mine = tmp_path / "shipped", tmp_path / "mine"
+    monkeypatch.setattr(results, "SHIPPED", shipped)
+    place = store_run(shipped, "nnit", pick, outcomes(0.9, 80)).folder.relative_to(shipped)
+    store_run(mine, "crop", pick, outcomes(0.5, 80))
+    folders = (mine, shipped)
+    report(folders=folders, output=tmp_path / "report", as_json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert {run["method"]["name"]: run["shipped"] for run in printed} == {"nnit": True, "crop": False}
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "\n| nnit, shipped |" in text and "\n| crop |" in text
+    rows = csv.DictReader((tmp_path / "report" / "report.csv").open())
+    assert {(row["method"], row["shipped"]) for row in rows} == {("nnit", "True"), ("crop", "False")}
+    paper.reproduce(table="full-distribution", folders=folders)
+    assert "shipped, not run here: NNiT on PickCube-v1, unseen" in capsys.readouterr().out
+
+    def chosen() -> Path:
+        return results.latest(results.find(folders))["PickCube-v1", "unseen", "nnit"].folder
+
+    shutil.copytree(shipped / place, mine / place)  # the very same run
+    assert chosen() == mine / place
+    shutil.rmtree(mine / place)
+    quick = pick.model_copy(update={"select": Episodes(first=pick.select.first, count=5)})
+    store_run(mine, "nnit", quick, outcomes(0.9, 80)[:, :5])
+    assert chosen() == shipped / place
+    again = store_run(mine, "nnit", pick.model_copy(update={"seed": 1}), outcomes(0.8, 80))
+    assert chosen() == again.folder
 
 
 def test_a_missing_run_is_answered_with_its_command(store: Store, pick: Protocol) -> None:
@@ -109,8 +143,8 @@ def test_our_row_stands_under_the_papers(store: Store, pick: Protocol, capsys: p
     top = run.record.results.estimates["success_at_end"]["top"]
     assert rows["NNiT, unseen"][1] == paper.Number.of(top, 100)
     assert rows["NNiT, seen"] == (None,) * 6
-    assert "missing: nnit-bench run --method nnit --task PickCube-v1 --split seen" in table.missing
-    assert "missing: SANE is not in this version of nnit" in table.missing
+    assert "missing: nnit-bench run --method nnit --task PickCube-v1 --split seen" in table.notes
+    assert "missing: SANE is not in this version of nnit" in table.notes
 
     (full,) = paper.full_distribution(results.latest(results.find(folders)))
     worst = run.record.results.estimates["success_at_end"]["worst"]
