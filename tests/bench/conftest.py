@@ -202,6 +202,8 @@ def zoo_index() -> pa.Table:
             "shard": [f"{name}.safetensors" for name in architectures],
             "row": [0, 1, 0, 1, 0],
             "sha256": [""] * count,
+            "n_params": [1] * count,
+            "weight_norm": [1.0] * count,
         },
         INDEX_SCHEMA,
     )
