@@ -9,7 +9,10 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Commit:
-    """A commit, and whether the checkout has changes that are not in it; both None outside a checkout."""
+    """A commit, and whether the checkout has changes that are not in it; both None outside a checkout.
+
+    Zoos do not count as changes: building one writes it beside the code, and records hold its hashes.
+    """
 
     sha: str | None
     dirty: bool | None
@@ -24,7 +27,8 @@ def commit() -> Commit:
     # Installed inside somebody else's checkout, this file is not that checkout's: git must track it.
     if _git("ls-files", "--error-unmatch", __file__) is None:
         return Commit(None, None)
-    return Commit(_git("rev-parse", "HEAD"), bool(_git("status", "--porcelain")))
+    changes = _git("status", "--porcelain", "--", ":(top)", ":(top,exclude)nnit_zoo/data")
+    return Commit(_git("rev-parse", "HEAD"), bool(changes))
 
 
 def _git(*arguments: str) -> str | None:
