@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import threading
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -171,13 +170,8 @@ def hub(shipped, monkeypatch):
     spec.loader.exec_module(stand_in)
     server = stand_in.Hub()
     server.files["owner/name"] = {f"PickCube-v1/{path.name}": path.read_bytes() for path in shipped.zoo.iterdir()}
-    stand_in.point_at(server.address, monkeypatch)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    yield server
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with stand_in.serving(server, monkeypatch):
+        yield server
 
 
 @pytest.mark.parametrize("page", [name for name, text in PAGES.items() if steps(text)])

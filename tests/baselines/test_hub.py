@@ -3,7 +3,6 @@
 import hashlib
 import importlib.util
 import re
-import threading
 from pathlib import Path
 
 import pytest
@@ -55,14 +54,9 @@ class ModelHandler(stand_in.Handler):
 def hub(tmp_path, monkeypatch):
     server = stand_in.Hub()
     server.RequestHandlerClass = ModelHandler
-    stand_in.point_at(server.address, monkeypatch)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    yield server
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with stand_in.serving(server, monkeypatch):
+        yield server
 
 
 def test_what_is_pushed_comes_back_the_same(hub, view):
