@@ -54,6 +54,13 @@ class ExpertConfig(BaseModel):
     stop_return: float = 39.0
 
 
+CONFIGS = {
+    "PushCube-v1": ExpertConfig(stop_success=0.98, stop_return=42.0),
+    "StackCubeEasy-v1": ExpertConfig(stop_success=0.95, stop_return=38.0, total_steps=12_000_000),
+}
+"""Of tasks whose expert stops at other scores than PickCube-v1's, or learns for longer."""
+
+
 class ActorCritic(nn.Module):
     """Separate 3-layer Tanh networks for the mean action and the value, and one log standard deviation per action."""
 

@@ -245,7 +245,8 @@ class RobotBuilder(Builder):
     ) -> None:
         super().__init__(task, work, seeds, workers, parallel)
         self.task: RobotPolicyTask = task
-        self.expert_config, self.distill_config, self.twins_config = ExpertConfig(), DistillConfig(), TwinsConfig()
+        self.expert_config = experts.CONFIGS.get(task.name, ExpertConfig())
+        self.distill_config, self.twins_config = DistillConfig(), TwinsConfig()
 
     def expert(self) -> None:
         """Train the expert, then fix the task's standardisation from the states that it visits."""
@@ -270,6 +271,8 @@ class RobotBuilder(Builder):
         write_atomically(self.data / PROBE, lambda temporary: save_file({"states": probe}, temporary))
         experts.save(network, self.data / "expert.safetensors")
         log(f"expert: {json.dumps(record)}")
+        if not experts.good_enough(self.expert_config, record):
+            log("expert: it is below the scores to stop at; its students can only be worse")
 
     def states(self) -> None:
         """Gather the shared buffer of states by DAgger."""
