@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
+from cyclopts.validators import Number
 
 from nnit_zoo.console import print_json, print_rows, print_table
 from nnit_zoo.errors import UserError
@@ -139,7 +139,7 @@ def verify(
     task: str = "PickCube-v1",
     *,
     split: list[Split] | None = None,
-    deep: int = 0,
+    deep: Annotated[int, Parameter(validator=Number(gte=0))] = 0,
     folder: Path | None = None,
     as_json: Json = False,
 ) -> None:
@@ -152,10 +152,10 @@ def verify(
         folder: Where the zoo is, if not in the cache of huggingface_hub.
         as_json: Print JSON.
     """
-    from nnit_zoo import files, tasks
+    from nnit_zoo import files
     from nnit_zoo import verify as checks
     from nnit_zoo.display import Display
-    from nnit_zoo.zoo import locate
+    from nnit_zoo.zoo import Zoo, locate
 
     place = locate(task, folder)
     splits = split or files.SPLITS
@@ -164,8 +164,8 @@ def verify(
         problems = checks.verify(place, tell, splits)
     scored: list[dict[str, Any]] = []
     if deep and not problems:
-        episodes = deep * len(tasks.get(task).scoring_seeds)
-        with Display(quiet=False).stage(f"scoring {deep} policies", episodes) as tell:
+        episodes = [policy.record["episodes"] for policy in checks.sample(Zoo.open(place), deep, splits)]
+        with Display(quiet=False).stage(f"scoring {len(episodes)} policies", sum(episodes)) as tell:
             scored = checks.rescore(place, deep, tell, splits)
         problems = [f"{row['id']} scores otherwise than the index says" for row in scored if not row["agrees"]]
     if as_json:
@@ -301,16 +301,17 @@ def push(repository: str, *, task: list[str] | None = None, folder: Path | None 
 
 
 def run(application: App) -> None:
-    """Run a command line; a mistake of the user becomes `error: ...` on stderr and exit code 2."""
+    """Run a command line; a mistake of the user, or what the system refuses, becomes `error: ...` and exit code 2."""
     try:
         application(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
     except (UserError, CycloptsError) as error:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(2)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
+        if error.errno is None:
             raise
-        sys.stderr.write(f"error: cannot write {error.filename}: {error.strerror}\n")
+        place = f"cannot read or write {error.filename}: " if error.filename else ""
+        sys.stderr.write(f"error: {place}{error.strerror}\n")
         sys.exit(2)
 
 

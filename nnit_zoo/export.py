@@ -18,7 +18,7 @@ from nnit_zoo.atomic import write_bytes
 from nnit_zoo.errors import UserError, unknown_name
 from nnit_zoo.zoo import Zoo
 
-OPSET = 17
+OPSET, IR = 17, 8  # both of onnx 1.12: an older onnxruntime refuses a newer IR
 
 
 def export(zoo: Zoo, name: str, output: Path) -> None:
@@ -77,7 +77,8 @@ def _graph(module: nn.Sequential, record: Mapping[str, Any]) -> bytes:
     sizes = {"observation": state["0.weight"].shape[1], "output": state[f"{len(module) - 1}.bias"].shape[0]}
     ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", size]) for name, size in sizes.items()]
     graph = helper.make_graph(nodes, record["id"], ends[:1], ends[1:], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="nnit")
+    opsets = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(graph, opset_imports=opsets, ir_version=IR, producer_name="nnit")
     helper.set_model_props(model, {"nnit": json.dumps(record)})
     checker.check_model(model)
     return bytes(model.SerializeToString(deterministic=True))

@@ -23,6 +23,7 @@ from huggingface_hub import cached_assets_path
 from pydantic import BaseModel, Field, ValidationError
 
 from nnit_zoo import architecture as known
+from nnit_zoo import tasks
 from nnit_zoo.atomic import write_bytes
 from nnit_zoo.errors import UserError, unknown_name
 
@@ -80,6 +81,8 @@ class Manifest(BaseModel):
     outputs: int
     index: Entry
     shards: dict[Annotated[str, Field(pattern=r"^\d+(-\d+)*\.safetensors$")], Entry]
+    standardisation: str | None = None
+    """Hash of what the policies' observations are standardised by, `Task.standardisation`; an older zoo has none."""
 
     @classmethod
     def read(cls, folder: Path) -> Manifest:
@@ -98,7 +101,7 @@ class Manifest(BaseModel):
 
     def to_bytes(self) -> bytes:
         """The content of manifest.json, the same bytes for the same manifest."""
-        return (self.model_dump_json(indent=2, by_alias=True) + "\n").encode()
+        return (self.model_dump_json(indent=2, by_alias=True, exclude_none=True) + "\n").encode()
 
     def missing(self, folder: Path, names: Collection[str]) -> dict[str, Entry]:
         """Of these files, those that `folder` lacks or holds in another form."""
@@ -215,14 +218,21 @@ def pass_rates(selection: Path) -> dict[str, float]:
     return dict(zip(rows["architecture"].to_pylist(), rows["passed_mean"].to_pylist(), strict=True))
 
 
+def ghns_of(selection: Path) -> int:
+    """The number of GHNs that made the candidates."""
+    return len(pc.unique(pq.ParquetFile(selection).read(["ghn_seed"])["ghn_seed"]))
+
+
 def tasks_with_zoo() -> tuple[str, ...]:
     """The tasks whose zoo is embedded in this package."""
     return tuple(sorted(path.parent.name for path in EMBEDDED.glob(f"*/{MANIFEST}")))
 
 
 def embedded(task: str) -> Path:
-    """The folder with the task's embedded zoo; raises UserError, with near names, if there is none."""
+    """The folder with the task's embedded zoo; raises UserError, with the command or near names, if there is none."""
     if task not in tasks_with_zoo():
+        if task in tasks.names():
+            raise UserError(f"{task} has no zoo yet; build it with: nnit-zoo build --task {task}")
         raise unknown_name("zoo", task, tasks_with_zoo())
     return EMBEDDED / task
 
@@ -255,9 +265,7 @@ def default_folder(task: str) -> Path:
     try:
         return cached_assets_path("nnit", "zoo", task)
     except (OSError, ValueError) as error:
-        raise UserError(
-            f"no cache folder for zoos ({error}); set HF_HOME to a folder that you can write, or give --folder"
-        ) from None
+        raise UserError(f"no cache folder for zoos ({error}); set HF_HOME to a folder that you can write") from None
 
 
 def download_command(task: str, folder: Path) -> str:

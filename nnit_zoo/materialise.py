@@ -71,8 +71,10 @@ def materialise(
     )
 
 
-def write_manifest(data_folder: Path) -> None:
+def write_manifest(data_folder: Path, standardisation: str | None = None) -> None:
     """Write index.parquet and manifest.json beside the GHNs and the selection table that they follow from.
+
+    The manifest keeps `standardisation`, the hash of what the policies' observations are standardised by.
 
     Raises UserError if a kept policy has a parameter that is not finite in float16.
     """
@@ -98,6 +100,7 @@ def write_manifest(data_folder: Path) -> None:
         outputs=source.outputs,
         index=Entry.of(buffer.getvalue()),
         shards=shards,
+        standardisation=standardisation,
     )
     write_bytes(data_folder / files.INDEX, buffer.getvalue())
     write_bytes(data_folder / files.MANIFEST, manifest.to_bytes())

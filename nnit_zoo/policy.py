@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import SupportsIndex
 
 import torch
 from torch import Tensor, nn
@@ -33,10 +35,10 @@ class PolicyBatch:
     def __len__(self) -> int:
         return int(self.layers[0].shape[0])
 
-    def __getitem__(self, index: int | slice | Sequence[int]) -> PolicyBatch:
+    def __getitem__(self, index: SupportsIndex | slice | Sequence[int]) -> PolicyBatch:
         """The policies at an index, slice or list of indices; always a batch."""
-        if isinstance(index, int):
-            index = [index]
+        if isinstance(index, SupportsIndex) and getattr(index, "ndim", 0) == 0:  # arrays of indices have it too
+            index = [operator.index(index)]
         return PolicyBatch(self.architecture, tuple(layer[index] for layer in self.layers))
 
     def __iter__(self) -> Iterator[PolicyBatch]:
@@ -75,8 +77,8 @@ class PolicyBatch:
             if depth == 0 and mean is not None and std is not None:
                 weight = weight / std.double()
                 bias = bias - weight @ mean.double()
-            linear = nn.Linear(weight.shape[1], weight.shape[0])
-            linear.load_state_dict({"weight": weight.float(), "bias": bias.float()})
+            linear = nn.Linear(weight.shape[1], weight.shape[0], device="meta")  # draws no weights of its own
+            linear.load_state_dict({"weight": weight.float(), "bias": bias.float()}, assign=True)
             modules += [linear, nn.Tanh()]
         return nn.Sequential(*modules[:-1])
 

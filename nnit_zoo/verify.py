@@ -13,9 +13,10 @@ from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture, split_of
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import HELDOUT_SEEDS_FROM, Progress
-from nnit_zoo.zoo import Zoo, damaged, policy_hashes, read_shard
+from nnit_zoo.zoo import Policy, Zoo, damaged, policy_hashes, read_shard
 
-TOLERANCE = 0.05  # of a score, or of 1 if that is more
+DIFFERING = 3  # episodes of a policy that another processor may let end otherwise
+ROUNDING = 1e-6  # of a mean of the same scores
 
 
 def verify(folder: Path, progress: Progress | None = None, splits: Collection[str] = files.SPLITS) -> list[str]:
@@ -52,21 +53,28 @@ def verify(folder: Path, progress: Progress | None = None, splits: Collection[st
     return problems
 
 
+def sample(zoo: Zoo, count: int, splits: Collection[str] = files.SPLITS) -> list[Policy]:
+    """`count` policies of these splits, or all if there are fewer, evenly spread over the index."""
+    zoo = zoo.filter(pc.field("split").isin(list(splits)))
+    ids = zoo.index["id"].to_pylist()
+    count = min(count, len(ids))
+    return [zoo[ids[len(ids) * number // count]] for number in range(count)]
+
+
 def rescore(
     folder: Path, count: int, progress: Progress | None = None, splits: Collection[str] = files.SPLITS
 ) -> list[dict[str, Any]]:
-    """Play the build's episodes again with `count` policies, evenly spread over the index: a row for each.
+    """Play the build's episodes again with the policies of `sample(zoo, count, splits)`: a row for each.
 
     A row has the policy's id, each of its scores as `stored_` and `now_`, and whether they agree. The same kind of
-    processor gives the same numbers; another may round otherwise and let a few episodes end otherwise. `progress` is
-    called with the number of newly finished episodes. Raises UserError as `Task.evaluate` does.
+    processor gives the same numbers. Another may round otherwise: in a task with success, whose episodes are simulated,
+    three of them may then end otherwise, each worth up to 1 or the zoo's best return. `progress` is called with the
+    number of newly finished episodes. Raises UserError as `Task.evaluate` does.
     """
     zoo = Zoo.open(folder)
-    zoo = zoo.filter(pc.field("split").isin(list(splits)))
     task = tasks.get(zoo.task)
-    ids = zoo.index["id"].to_pylist()
-    count = min(count, len(ids))
-    chosen = [zoo[ids[len(ids) * number // count]] for number in range(count)]
+    worth = {"success_at_end": 1.0, "success_once": 1.0, "return": pc.max(zoo.index["return"]).as_py()}
+    chosen = sample(zoo, count, splits)
     now: dict[str, dict[str, Any]] = {}
     for episodes in dict.fromkeys(policy.record["episodes"] for policy in chosen):
         group = [policy for policy in chosen if policy.record["episodes"] == episodes]
@@ -78,10 +86,12 @@ def rescore(
     rows = []
     for policy in chosen:
         row = {"id": policy.record["id"], "agrees": True}
+        simulated = policy.record["success_at_end"] is not None
+        share = DIFFERING / policy.record["episodes"] if simulated else 0
         for score in files.SCORES:
             before, after = policy.record[score], now[row["id"]][f"{score}_mean"]
             row |= {f"stored_{score}": before, f"now_{score}": after}
-            row["agrees"] &= before is None or abs(after - before) <= TOLERANCE * max(before, 1)
+            row["agrees"] &= before is None or abs(after - before) <= share * worth[score] + ROUNDING
         rows.append(row)
     return rows
 

@@ -62,6 +62,12 @@ class Zoo:
         manifest = files.Manifest.read(folder)
         if not manifest.index.describes(folder / files.INDEX):
             raise damaged(folder / files.INDEX, manifest.task)
+        wanted = manifest.standardisation
+        if wanted is not None and wanted != tasks.get(manifest.task).standardisation:
+            raise UserError(
+                f"the policies in {folder} expect observations that are standardised otherwise than by this version of "
+                "nnit; use the version that made them"
+            )
         return cls(folder, manifest, files.read_index(folder / files.INDEX))
 
     @property
@@ -192,24 +198,22 @@ class TrainingView:
         """The architectures that have policies here."""
         return tuple(self.batches)
 
-    def batch(self, architecture: Architecture) -> PolicyBatch:
+    def batch(self, architecture: Architecture | str) -> PolicyBatch:
         """The policies of an architecture in float32; raises UserError if it is not in this view."""
-        self._check_here(architecture)
-        return self.batches[architecture].to(torch.float32)
+        return self.batches[self._here(architecture)].to(torch.float32)
 
-    def ghn_seeds(self, architecture: Architecture) -> tuple[int, ...]:
+    def ghn_seeds(self, architecture: Architecture | str) -> tuple[int, ...]:
         """The GHN seed of each policy of `batch(architecture)`; raises UserError if it is not in this view."""
-        self._check_here(architecture)
-        if self.seeds is None:
-            return tuple(range(len(self.batches[architecture])))
-        return self.seeds[architecture]
+        here = self._here(architecture)
+        return tuple(range(len(self.batches[here]))) if self.seeds is None else self.seeds[here]
 
     def __len__(self) -> int:
         return sum(map(len, self.batches.values()))
 
-    def _check_here(self, architecture: Architecture) -> None:
-        if architecture in self.batches:
-            return
+    def _here(self, architecture: Architecture | str) -> Architecture:
+        for here in self.batches:
+            if str(here) == str(architecture):
+                return here
         if not self.reference and split_of(architecture) in ("unseen", "excluded"):
             raise UserError(f"{architecture} is {split_of(architecture)}: its policies are never for training")
         raise unknown_name("architecture in this view", str(architecture), map(str, self.batches))

@@ -176,7 +176,6 @@ def hub(shipped, monkeypatch):
 
 @pytest.mark.parametrize("page", [name for name, text in PAGES.items() if steps(text)])
 def test_what_a_page_says_works(page, machine, hub, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(machine)
     monkeypatch.setattr(render, "camera", blank_pictures)  # real ones are a slow test's
     for language, text in steps(PAGES[page]):
         if language == "python":

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 CARD = """---
-license: cc-by-4.0
-library_name: nnit
+{licence}library_name: nnit
 tags:
 - weight-generation
 - {task}
@@ -36,7 +35,8 @@ To score it: `nnit-bench run --method {method} --task {task} --checkpoint FOLDER
 """
 
 
-def card(name: str, method: str, task: str, training: Mapping[str, Any]) -> str:
+def card(name: str, method: str, task: str, training: Mapping[str, Any], licence: str | None) -> str:
     """The card of a checkpoint of the class `name`, which is found as `method`, for `task`."""
     facts = "\n".join(f"| {key.replace('_', ' ')} | {value} |" for key, value in training.items())
-    return CARD.format(name=name, method=method, task=task, facts=facts)
+    line = f"license: {licence}\n" if licence else ""
+    return CARD.format(name=name, method=method, task=task, facts=facts, licence=line)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import json
 import sys
 import tempfile
@@ -13,9 +14,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import safetensors.torch
+import torch
 from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 from safetensors import SafetensorError
@@ -46,6 +48,8 @@ CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
 CARD = "README.md"
 METADATA = {"format": "pt"}
+FILE_MODULE = "nnit_method_"
+"""Begins the name of the module that a method's file becomes."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +105,12 @@ class Generator(ABC):
 
     capabilities: Capabilities
     """Set by the class; a fitted generator may narrow its own."""
-
-    def __init__(self) -> None:
-        self.task = ""
-        """Name of the task that the networks solve; set by `fit`."""
-        self.training: dict[str, Any] = {}
-        """Facts about the training, kept in config.json."""
+    licence: ClassVar[str | None] = None
+    """Of its checkpoints, for their model card, by the Hub's name for it."""
+    task: str = ""
+    """Name of the task that the networks solve; set by `fit`."""
+    training_facts: Mapping[str, Any] = {}
+    """What is known of the training, kept in config.json."""
 
     @classmethod
     def from_preset(cls, name: str) -> Self:
@@ -128,13 +132,13 @@ class Generator(ABC):
 
     @abstractmethod
     def sample(self, request: SampleRequest) -> PolicyBatch:
-        """The requested networks, float32: the same for the same request, whatever was asked before.
+        """The requested networks, float32, on the CPU: the same for the same request, whatever was asked before.
 
         Raises UserError if this generator does not support that architecture.
         """
 
     def sample_joint(self, policies: int, seed: int) -> list[PolicyBatch]:
-        """`policies` networks of architectures that the generator chooses, float32; the same for the same arguments.
+        """`policies` networks of architectures that it chooses, float32, on the CPU; the same for the same arguments.
 
         One batch for each architecture chosen, in the order of the architectures. Raises UserError if this generator
         does not choose architectures.
@@ -155,13 +159,18 @@ class Generator(ABC):
         raise UserError(f"{cls.__name__} keeps no checkpoint: it is made from the zoo at every run")
 
     def save_pretrained(self, folder: Path | str) -> None:
-        """Write config.json, model.safetensors and a model card, the Hub's convention, into `folder`."""
-        folder = Path(folder)
-        config = {"method": type(self).__name__, "task": self.task, **self.config(), "training": self.training}
-        tensors = self.tensors()
+        """Write config.json, model.safetensors and a model card, the Hub's convention, into `folder`.
+
+        Raises UserError if `config` has a key of ours: method, task or training.
+        """
+        folder, kind, own = Path(folder), type(self), self.config()
+        config = {"method": kind.__name__, "task": self.task, "training": dict(self.training_facts)}
+        if taken := sorted(config.keys() & own.keys()):
+            raise UserError(f"config() of {kind.__name__} has the reserved key {taken[0]}; give it another name")
+        config, tensors = config | own, self.tensors()
         write_atomically(folder / WEIGHTS, lambda path: safetensors.torch.save_file(tensors, path, METADATA))
         write_json(folder / CONFIG, config)
-        text = card(type(self).__name__, _address(type(self)), self.task, self.training)
+        text = card(kind.__name__, _address(kind), self.task, self.training_facts, self.licence)
         write_bytes(folder / CARD, text.encode())
 
     @classmethod
@@ -177,9 +186,10 @@ class Generator(ABC):
             if config["method"] != cls.__name__:
                 raise UserError(f"the checkpoint in {source} is of {config['method']}, not of {cls.__name__}")
             generator = cls.from_state(config, safetensors.torch.load_file(folder / WEIGHTS))
-            generator.task, generator.training = config["task"], config["training"]
+            generator.task, generator.training_facts = config["task"], config["training"]
         except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
-            raise UserError(f"the checkpoint in {source} cannot be read: {error}") from None
+            what = f"{type(error).__name__}: {error}"
+            raise UserError(f"the checkpoint in {source} cannot be read: {what}") from error
         if task is not None and generator.task != task:
             raise UserError(f"the checkpoint in {source} is for {generator.task}, not for {task}")
         return generator
@@ -197,6 +207,19 @@ def refuse_reference(view: TrainingView) -> None:
     """Raise UserError if the view holds yardsticks, such as unseen architectures, instead of training data."""
     if view.reference:
         raise UserError("a reference view is never for training; use zoo.training_view()")
+
+
+def check_batch(name: str, batch: object) -> PolicyBatch:
+    """What a generator gave, if it is as it must be; raises UserError if not, with `name` as the one who gave it."""
+    if not isinstance(batch, PolicyBatch):
+        raise UserError(f"{name} gave a {type(batch).__name__}, not a PolicyBatch")
+    if types := {layer.dtype for layer in batch.layers} - {torch.float32}:
+        raise UserError(f"{name} gave {', '.join(sorted(map(str, types)))}; end with: batch.to(torch.float32)")
+    if places := {layer.device.type for layer in batch.layers} - {"cpu"}:
+        raise UserError(f"{name} gave networks on {places.pop()}; move their layers to the CPU")
+    if any(layer.requires_grad for layer in batch.layers):
+        raise UserError(f"{name} gave layers that require a gradient; sample under torch.inference_mode()")
+    return batch
 
 
 def names() -> tuple[str, ...]:
@@ -218,16 +241,23 @@ def available() -> dict[str, type[Generator]]:
 def get(name: str) -> type[Generator]:
     """The generator class with this name, or at `package.module:Class` or `path/to/file.py:Class`.
 
-    Raises UserError, with near names, if there is none.
+    A file finds modules beside it, and a module those of the current folder. Raises UserError, with near names, if
+    there is no such class.
     """
     if name in BUILT_IN:
         return _load(BUILT_IN[name])
     installed = entry_points(group=ENTRY_POINTS)
     if name in installed.names:
         return _load(installed[name].value)
-    if ":" in name:
-        return _load(name)
-    raise unknown_name("method", name, names())
+    if name.endswith(".py"):
+        raise UserError(f"'{name}' names no class; write {name}:ClassName")
+    if ":" not in name:
+        raise unknown_name("method", name, names())
+    place, _, _ = name.rpartition(":")
+    folder = str(Path(place).resolve().parent if place.endswith(".py") else Path.cwd())
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    return _load(name)
 
 
 def checkpoint(name: str, task: str) -> Path | None:
@@ -236,16 +266,16 @@ def checkpoint(name: str, task: str) -> Path | None:
     return folder if (folder / CONFIG).is_file() else None
 
 
-def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None) -> Generator:
+def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None, seed: int = 0) -> Generator:
     """The generator called `name`, ready to sample networks of `split` for the zoo's task.
 
-    A trained method is read from `source`, by default from its shipped checkpoint; a control is fitted on the zoo.
+    A trained method is read from `source`, by default from its shipped checkpoint; others are fitted here, with `seed`.
     Raises UserError if there is no checkpoint, or it is for another task.
     """
     kind = get(name)
     if not kind.capabilities.checkpoint:
         generator = kind()
-        generator.fit(zoo.reference_view(split) if kind.capabilities.oracle else zoo.training_view())
+        generator.fit(zoo.reference_view(split) if kind.capabilities.oracle else zoo.training_view(), Run(seed=seed))
         return generator
     found = source or checkpoint(name, zoo.task)
     if found is None:
@@ -270,17 +300,24 @@ def _load(address: str) -> type[Generator]:
         raise unknown_name(f"class in {place}", attribute, [name for name in vars(module) if name[0].isupper()])
     if not (isinstance(found, type) and issubclass(found, Generator)):
         raise UserError(f"'{address}' is not a subclass of nnit_baselines.generator.Generator")
+    if missing := sorted(found.__abstractmethods__):
+        raise UserError(f"'{address}' does not define {' and '.join(missing)}")
+    if not isinstance(getattr(found, "capabilities", None), Capabilities):
+        raise UserError(f"'{address}' does not declare what it can do; set capabilities = Capabilities() in the class")
     return found
 
 
 def _address(kind: type[Generator]) -> str:
-    """What `get` finds the class by: its name if it is built in."""
+    """What `get` finds the class by: its name if it has one."""
+    if kind.__module__.startswith(FILE_MODULE):
+        return f"{Path(inspect.getfile(kind)).name}:{kind.__qualname__}"
     address = f"{kind.__module__}:{kind.__qualname__}"
-    return next((name for name, built_in in BUILT_IN.items() if built_in == address), address)
+    named = BUILT_IN | {each.name: each.value for each in entry_points(group=ENTRY_POINTS)}
+    return next((name for name, value in named.items() if value == address), address)
 
 
 def _run_file(path: Path) -> Any:
-    spec = importlib.util.spec_from_file_location(f"nnit_method_{path.stem}", path)
+    spec = importlib.util.spec_from_file_location(f"{FILE_MODULE}{path.stem}", path)
     if spec is None or spec.loader is None or not path.is_file():
         raise UserError(f"no such file: {path}")
     module = importlib.util.module_from_spec(spec)

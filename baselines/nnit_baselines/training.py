@@ -29,7 +29,11 @@ def train(
     view = zoo.training_view()
     generator = kind() if preset is None else kind.from_preset(preset)
     generator.fit(view, run)
-    generator.training |= {
+    generator.training_facts = {
+        **generator.training_facts,
+        "seed": run.seed,
+        **({} if run.steps is None else {"steps": run.steps}),
+        **({} if preset is None else {"preset": preset}),
         "policies": len(view),
         "zoo_manifest_sha256": sha256_of(zoo.folder / MANIFEST),
         "git_commit": str(commit()),

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import random
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -15,7 +17,7 @@ import torch
 
 from nnit_baselines.controls.initial import Random
 from nnit_baselines.controls.resized import resize
-from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest, get
+from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest, check_batch, get
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.cli import Json
 from nnit_zoo.errors import UserError
@@ -55,16 +57,19 @@ def check(*, method: str, as_json: Json = False) -> None:
         method: Name, package.module:Class or path/to/file.py:Class of a generator.
         as_json: Print JSON.
     """
-    verdicts = list(examine(get(method)))
+    verdicts = []
+    for each in examine(get(method)):
+        verdicts.append(each)
+        if not as_json:  # at once: a method that trains for long in spite of being asked for few steps is seen to do so
+            sys.stdout.write(f"{'BROKEN' if each.problem else 'kept':8}{each.clause}\n")
+            if each.problem:
+                sys.stdout.write(f"{'':8}{each.problem}\n")
+            sys.stdout.flush()
     broken = [each for each in verdicts if each.problem]
     if as_json:
         answer = {"method": method, "kept": not broken, "clauses": [asdict(each) for each in verdicts]}
         sys.stdout.write(json.dumps(answer, indent=2) + "\n")
     else:
-        for each in verdicts:
-            sys.stdout.write(f"{'BROKEN' if each.problem else 'kept':8}{each.clause}\n")
-            if each.problem:
-                sys.stdout.write(f"{'':8}{each.problem}\n")
         sys.stdout.write(f"{method} " + (f"breaks {len(broken)} clauses\n" if broken else "keeps the contract\n"))
     if broken:
         sys.exit(1)
@@ -182,6 +187,12 @@ def _gives(subject: Subject) -> None:
             batches = ask(policies, 0)
             for batch in batches:
                 _check_batch(name, batch)
+                shape = batch.architecture
+                if (shape.inputs, shape.outputs) != (INPUTS, OUTPUTS):
+                    raise Broken(
+                        f"{name} gave networks of {shape.inputs} inputs and {shape.outputs} outputs, "
+                        f"but the task has {INPUTS} and {OUTPUTS}"
+                    )
             if name == "sample":
                 given = [(batch.architecture, len(batch)) for batch in batches]
                 expected = [(each, policies) for each in subject.view.architectures[1:3]]
@@ -274,9 +285,16 @@ def _comes_back(subject: Subject) -> None:
     with TemporaryDirectory() as folder:
         subject.generator.save_pretrained(folder)
         back = subject.kind.from_pretrained(folder, subject.view.task)
+    if back.capabilities != subject.generator.capabilities:
+        raise Broken(
+            f"before save_pretrained it declared {subject.generator.capabilities}, "
+            f"after from_pretrained {back.capabilities}; let from_state narrow them as fit does"
+        )
+    for text in (*SEEN, *OTHERS):
+        architecture = Architecture.parse(text, INPUTS, OUTPUTS)
+        if back.supports(architecture) != subject.generator.supports(architecture):
+            raise Broken(f"after save_pretrained and from_pretrained, supports answers otherwise for {text}")
     again = subject.ways(back)
-    if again.keys() != before.keys():
-        raise Broken(f"before save_pretrained it had {sorted(before)}, after from_pretrained {sorted(again)}")
     for name, batches in before.items():
         if not _equal(batches, again[name](3, 7)):
             raise Broken(f"after save_pretrained and from_pretrained, {name} gives other networks for the same request")
@@ -288,16 +306,17 @@ def _problem(clause: Clause, subject: Subject) -> str | None:
     except Broken as broken:
         return str(broken)
     except Exception as error:  # the method's own, which may fail in any way
-        return f"{type(error).__name__}: {error}"
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f" ({Path(last.filename).name}, line {last.lineno})"
+        return f"{type(error).__name__}: {error}{where}"
     return None
 
 
-def _check_batch(name: str, batch: object) -> None:
-    if not isinstance(batch, PolicyBatch):
-        raise Broken(f"{name} gave a {type(batch).__name__}, not a PolicyBatch")
-    types = {layer.dtype for layer in batch.layers}
-    if types != {torch.float32}:
-        raise Broken(f"{name} gave {', '.join(sorted(map(str, types)))}; end with: batch.to(torch.float32)")
+def _check_batch(name: str, batch: PolicyBatch) -> None:
+    try:
+        check_batch(name, batch)
+    except UserError as error:
+        raise Broken(str(error)) from None
     if not batch.finite().all():
         raise Broken(f"{name} gave networks of {batch.architecture} with NaN or infinite parameters")
 

@@ -13,16 +13,19 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import inspect
 import json
 import os
 import platform
 import re
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distributions, version
 from importlib.util import find_spec
+from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any, Literal
 
@@ -321,9 +324,27 @@ def hash_files(files: Mapping[str, Path]) -> str:
     return total.hexdigest()
 
 
-def this_code(plugin: Path | None = None) -> Code:
-    """The code that is running, with the file of a method that is not one of ours."""
-    files = {} if plugin is None else {"method": plugin}
+def plugin_files(module: str) -> dict[str, Path]:
+    """Name -> source file of what a method in this loaded module is made of.
+
+    A package is all its files; a single file is itself and what it imports from beside it.
+    """
+    top = sys.modules[module.partition(".")[0]]
+    if hasattr(top, "__path__"):
+        roots = [Path(each) for each in top.__path__]
+        return {f"{root.name}/{path.relative_to(root)}": path for root in roots for path in root.rglob("*.py")}
+    file = Path(inspect.getfile(top))
+    if file.parent.name in ("site-packages", "dist-packages"):  # what is beside it is not its own
+        return {file.name: file}
+    finder = ModuleFinder([str(file.parent)], excludes=OUR_PACKAGES)
+    finder.run_script(str(file))
+    found = [Path(each) for module in finder.modules.values() if (each := vars(module)["__file__"])]
+    return {str(path.relative_to(file.parent)): path for path in found}
+
+
+def this_code(plugin: str | None = None) -> Code:
+    """The code that is running, with the module of a method that is not one of ours."""
+    files = {} if plugin is None else {f"method/{name}": path for name, path in plugin_files(plugin).items()}
     for package in OUR_PACKAGES:
         spec = find_spec(package)
         assert spec is not None and spec.origin is not None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import shutil
 import time
 from collections import Counter
@@ -19,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from nnit_baselines import generator as generators
-from nnit_baselines.generator import WEIGHTS, Generator, SampleRequest
+from nnit_baselines.generator import WEIGHTS, Generator, SampleRequest, check_batch
 from nnit_bench import novelty, records, views
 from nnit_bench.protocol import Protocol
 from nnit_bench.records import Identity, Method, RunRecord, Timings, ZooVersion
@@ -102,7 +101,7 @@ def enter(
     if reason:
         method = Method(name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None)
         return Contestant(method, kind, None, reason, 0.0)
-    generator = generators.prepare(name, zoo, protocol.split, checkpoint)
+    generator = generators.prepare(name, zoo, protocol.split, checkpoint, protocol.seed)
     if steps is not None:
         set_steps(name, generator, steps)
     method = describe(name, generator, given)
@@ -120,7 +119,7 @@ def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
         name=name,
         config=generator.config(),
         given=given,
-        training=generator.training,
+        training=dict(generator.training_facts),
         parameters=sum(tensor.numel() for tensor in generator.tensors().values()),
         checkpoint_sha256=sha256,
     )
@@ -157,7 +156,7 @@ def run(task: Task, zoo: Zoo, entrant: Contestant, protocol: Protocol, execution
     Raises UserError if the method or the task cannot, after recording that.
     """
     ours = entrant.kind.__module__.partition(".")[0] in records.OUR_PACKAGES
-    code = records.this_code(None if ours else Path(inspect.getfile(entrant.kind)))
+    code = records.this_code(None if ours else entrant.kind.__module__)
     sha256 = sha256_of(zoo.folder / MANIFEST)
     identity = Identity(
         protocol=protocol,
@@ -255,13 +254,13 @@ def sample(task: Task, entrant: Contestant, protocol: Protocol, stage: Stage) ->
         for text, count in protocol.policies.items():
             seed = sample_seed(protocol.seed, text)
             if protocol.is_joint:
-                batches += generator.sample_joint(count, seed)
+                batches += [check_batch(name, batch) for batch in generator.sample_joint(count, seed)]
                 given = sum(map(len, batches))
                 if given != count:
                     raise UserError(f"{name} was asked for {count} policies but gave {given}")
             else:
                 architecture = Architecture.parse(text, task.inputs, task.outputs)
-                batch = generator.sample(SampleRequest(architecture, count, seed))
+                batch = check_batch(name, generator.sample(SampleRequest(architecture, count, seed)))
                 if batch.architecture != architecture or len(batch) != count:
                     gave = f"{len(batch)} of {batch.architecture}"
                     raise UserError(f"{name} was asked for {count} policies of {architecture} but gave {gave}")

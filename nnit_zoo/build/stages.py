@@ -7,12 +7,13 @@ Intermediate states go to the work folder, finished artifacts to the package's d
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -35,8 +36,8 @@ from nnit_zoo.build.ghn import GHN
 from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import HELDOUT_SEEDS_FROM, SELECTION
-from nnit_zoo.materialise import stored, write_manifest
+from nnit_zoo.files import HELDOUT_SEEDS_FROM, SELECTION, ghns_of
+from nnit_zoo.materialise import GHNS, stored, write_manifest
 from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.provenance import commit
@@ -68,7 +69,9 @@ def build(
     *,
     task: str = "PickCube-v1",
     stage: Stage = "all",
-    seeds: int = 16,
+    seeds: Annotated[
+        int | None, Parameter(help="GHNs; by default as many as the zoo that ships was made by, or 16.")
+    ] = None,
     workers: int = 2,
     parallel: Annotated[
         Backend, Parameter(help="Where candidates are scored: on this machine, or on a Ray cluster.")
@@ -82,11 +85,20 @@ def build(
 ) -> None:
     """Build a task's zoo: what its GHNs learn from, one GHN per seed, every candidate's scores, and those that pass.
 
-    Run it again after a kill, at any moment, and it goes on. With `--stage`, only that stage. The stage `twins` is not
-    part of `all`: it makes nothing for the zoo, but NNiT's comparison of networks from GHNs with others, for `stats`.
+    The last stage, `pack`, puts the zoo into the package, in place of the one that is there. Run the command again
+    after a kill, at any moment, and it goes on. With `--stage`, only that stage. The stage `twins` is not part of
+    `all`: it makes nothing for the zoo, but NNiT's comparison of networks from GHNs with others, for `stats`.
     """
     torch.set_num_threads(1)
     chosen = tasks.get(task)
+    shipped = data_folder(task) / SELECTION
+    count = ghns_of(shipped) if shipped.exists() else 16
+    if seeds is not None and shipped.exists() and seeds < count:
+        raise UserError(
+            f"the zoo of {task} in {shipped.parent} was made by {count} GHNs, and one of {seeds} would replace it; "
+            "move it elsewhere first if that is meant"
+        )
+    seeds = count if seeds is None else seeds
     builder: Builder
     if isinstance(chosen, RobotPolicyTask) and source is None:
         require_simulator()
@@ -97,6 +109,8 @@ def build(
     else:
         raise UserError(f"--source is not for {task}" if source else f"this command cannot build {task}")
     known = (*builder.stages, *builder.analyses)
+    if workers < 1 or (seeds is not None and seeds < 1):
+        raise UserError("--workers and --seeds must be 1 or more")
     if stage not in ("all", *known):
         raise UserError(f"building {task} has no stage '{stage}': there are {', '.join(known)}")
     for name in builder.stages if stage == "all" else (stage,):
@@ -127,25 +141,23 @@ class Builder(ABC):
         """What trains the GHN of a seed into a file and returns a log line, and how, for the zoo's record."""
 
     def ghns(self) -> None:
-        """Train one GHN per seed, then stack them all into the data folder."""
-        train, record = self.training()
+        """Train one GHN per seed."""
+        train, settings = self.training()
         missing = [seed for seed in self.seeds if not self._ghn(seed).exists()]
+        self._sign("ghns", settings, works=bool(missing))
         with Display(quiet=False).stage("ghns", len(missing)) as advance:
             for _, line in unordered(lambda seed: train(self._ghn(seed), seed), missing, self.workers):
                 log(f"ghns: {line}")
                 advance(1)
-        states = [load_file(self._ghn(seed)) for seed in self.seeds]
-        stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
-        sizes = {"inputs": self.task.inputs, "outputs": self.task.outputs}
-        # One entry, because safetensors writes several in an order that changes from run to run.
-        note = {"nnit": json.dumps({"task": self.task.name, **sizes, "ghn_seeds": list(self.seeds)})}
-        write_atomically(self.data / "ghns.safetensors", lambda temporary: save_file(stacked, temporary, note))
-        self._record(ghns={**record, "commit": str(commit())})
 
     def scores(self) -> None:
         """Score every candidate, on exactly its stored float16 weights; a file per architecture."""
+        self._require_ghns()
         listed = [(split, each) for split in SPLITS for each in architectures(split, *self._sizes)]
         missing = [(split, architecture) for split, architecture in listed if not self._is_scored(architecture)]
+        episodes = self.task.scoring_seeds
+        counts = {"episodes": len(episodes), "yardstick_episodes": len(episodes[: self.yardstick_episodes])}
+        self._sign("scores", {**counts, "seeds_from": episodes.start}, works=bool(missing))
         count = sum(len(seeds) * len(episodes) for split, _ in missing for seeds, episodes in self._to_score(split))
         with Display(quiet=False).stage("scores: episodes", count) as advance:
             for split, architecture in missing:
@@ -162,7 +174,7 @@ class Builder(ABC):
 
     def _is_scored(self, architecture: Architecture) -> bool:
         path = self._scores(architecture)
-        return path.exists() and {*pq.read_table(path)["ghn_seed"].to_pylist()} == {*self.seeds}
+        return path.exists() and (pq.read_schema(path).metadata or {}).get(b"ghns") == self._ghns_sha256.encode()
 
     def _score(self, split: str, architecture: Architecture, advance: Callable[[int], None]) -> None:
         tables = []
@@ -172,7 +184,7 @@ class Builder(ABC):
             scored = self._evaluate(policies, episodes, self._units, advance)
             ghn_seeds = pa.array([seeds[index] for index in scored["policy"].to_pylist()], pa.int32())
             tables.append(scored.set_column(0, "ghn_seed", ghn_seeds).drop_columns(["reason"]))
-        table = pa.concat_tables(tables)
+        table = pa.concat_tables(tables).replace_schema_metadata({"ghns": self._ghns_sha256})
         write_atomically(self._scores(architecture), lambda temporary: pq.write_table(table, temporary))
         means = ", ".join(f"{metric.label} {pc.mean(table[metric.column]).as_py():.3f}" for metric in self.task.metrics)
         log(f"scores: {architecture} {means}")
@@ -185,7 +197,8 @@ class Builder(ABC):
         )
 
     def pack(self) -> None:
-        """Select per architecture by the thresholds and write the scores, the selection, the index and the manifest."""
+        """Select per architecture by the thresholds, and write the zoo with its GHNs and scores to the data folder."""
+        self._require_ghns()
         rows: list[dict[str, Any]] = []
         tables: list[pa.Table] = []
         for split in SPLITS:
@@ -195,6 +208,12 @@ class Builder(ABC):
                 table = pq.read_table(self._scores(architecture))
                 tables.append(table)
                 rows += select(self.task, split, str(architecture), table)
+        states = [load_file(self._ghn(seed)) for seed in self.seeds]
+        stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
+        sizes = {"inputs": self.task.inputs, "outputs": self.task.outputs}
+        # One entry, because safetensors writes several in an order that changes from run to run.
+        note = {"nnit": json.dumps({"task": self.task.name, **sizes, "ghn_seeds": list(self.seeds)})}
+        write_atomically(self.data / GHNS, lambda temporary: save_file(stacked, temporary, note))
         write_atomically(
             self.data / "scores.parquet",
             lambda temporary: pq.write_table(pa.concat_tables(tables), temporary, compression="zstd"),
@@ -205,12 +224,11 @@ class Builder(ABC):
                 pa.Table.from_pylist(rows, SELECTION_SCHEMA), temporary, compression="zstd"
             ),
         )
-        write_manifest(self.data)
+        write_manifest(self.data, self.task.standardisation)
         seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]
         passed, kept = (sum(row[name] for row in seen) for name in ("passed", "kept"))
-        episodes = self.task.scoring_seeds
-        counts = {"episodes": len(episodes), "yardstick_episodes": len(episodes[: self.yardstick_episodes])}
-        self._record(scores={**counts, "seeds_from": episodes.start, "commit": str(commit())})
+        made = {stage: json.loads(self._made(stage).read_text()) for stage in ("ghns", "scores")}
+        self._record(**made)
         log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass, {kept:,} are kept")
 
     @property
@@ -219,6 +237,34 @@ class Builder(ABC):
 
     def _ghn(self, seed: int) -> Path:
         return self.work / "ghns" / f"{seed:03d}.safetensors"
+
+    def _require_ghns(self) -> None:
+        for seed in self.seeds:
+            if not self._ghn(seed).exists():
+                raise UserError(f"GHN {seed} is not trained yet; run the stage 'ghns' first")
+
+    @cached_property
+    def _ghns_sha256(self) -> str:
+        """Of all GHNs: scores are those of these GHNs and no others."""
+        total = hashlib.sha256()
+        for seed in self.seeds:
+            for _, tensor in sorted(load_file(self._ghn(seed)).items()):
+                total.update(tensor.numpy().tobytes())
+        return total.hexdigest()
+
+    def _made(self, stage: str) -> Path:
+        """The record of what this stage has made in the work folder: its settings, and the commits that it ran from."""
+        return self.work / stage / "made.json"
+
+    def _sign(self, stage: str, settings: dict[str, Any], *, works: bool) -> None:
+        """Keep the stage's record; raises UserError if what is there was made with other settings."""
+        path, settings = self._made(stage), json.loads(json.dumps(settings))
+        made = json.loads(path.read_text()) if path.exists() else {**settings, "commits": []}
+        if {name: value for name, value in made.items() if name != "commits"} != settings:
+            raise UserError(f"{path.parent} was made with other settings, as {path.name} there says; move it elsewhere")
+        if works and (now := str(commit())) not in made["commits"]:
+            made["commits"].append(now)
+            write_json(path, made)
 
     @property
     def _units(self) -> Path:

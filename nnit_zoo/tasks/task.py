@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -130,6 +131,11 @@ class Task(ABC):
     def observation_std(self) -> npt.NDArray[np.float32]:
         """Scale [inputs] that policies' observations are divided by."""
         return np.array(self.record["observation_std"], np.float32)
+
+    @property
+    def standardisation(self) -> str:
+        """SHA-256 of mean and scale: policies fit no other."""
+        return hashlib.sha256(self.observation_mean.tobytes() + self.observation_std.tobytes()).hexdigest()
 
     def check(self, policies: Sequence[PolicyBatch], seeds: Sequence[int]) -> None:
         """Raise UserError for nothing to score, episodes that there are not, or policies of other sizes."""

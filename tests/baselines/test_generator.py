@@ -4,6 +4,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from nnit_baselines import generator as generators
 from nnit_baselines.controls.resized import Crop
@@ -39,6 +40,15 @@ class Constant(Generator):
 
 class Stranger:
     pass
+
+class Undeclared(Constant):
+    capabilities = None
+
+class Half(Generator):
+    capabilities = Capabilities()
+
+    def fit(self, view, run=None):
+        pass
 """
 
 
@@ -66,6 +76,49 @@ def test_a_class_in_a_file_or_a_module_is_a_method(plugin, monkeypatch):
     assert generators.get("plugin:Constant").__name__ == "Constant"
 
 
+@pytest.mark.parametrize("method", ["sub/one.py:Method", "beside:Method"])
+def test_a_method_finds_the_modules_beside_it(method, tmp_path, monkeypatch):
+    """As for `python file.py` and `python -m module`; nothing needs to be on the path."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for folder in (tmp_path, tmp_path / "sub"):
+        folder.mkdir(exist_ok=True)
+        (folder / "beside.py").write_text(PLUGIN.replace("Constant", "Method"))
+        monkeypatch.delitem(sys.modules, "beside", raising=False)
+    (tmp_path / "sub" / "one.py").write_text("from beside import Method\n")
+    assert generators.get(method).__name__ == "Method"
+    monkeypatch.delitem(sys.modules, "beside")
+
+
+def test_a_method_may_be_a_torch_module_too(plugin, view, tmp_path):
+    kind = generators.get(f"{plugin}:Constant")
+
+    class Both(kind, torch.nn.Module):
+        pass
+
+    made = Both()
+    made.fit(view)
+    made.train().save_pretrained(tmp_path)
+    assert Both.from_pretrained(tmp_path, view.task).training
+
+
+def test_a_setting_cannot_take_the_place_of_ours(plugin, tmp_path, monkeypatch):
+    kind = generators.get(f"{plugin}:Constant")
+    monkeypatch.setattr(kind, "config", lambda self: {"value": 1.0, "training": {"lr": 0.1}})
+    with pytest.raises(UserError, match="reserved key training"):
+        kind().save_pretrained(tmp_path / "saved")
+    assert not (tmp_path / "saved").exists()
+
+
+def test_a_method_without_a_checkpoint_is_fitted_with_the_runs_seed(plugin, view, monkeypatch):
+    kind, runs = generators.get(f"{plugin}:Constant"), []
+    monkeypatch.setattr(kind, "capabilities", generators.Capabilities(checkpoint=False))
+    monkeypatch.setattr(kind, "fit", lambda self, view, run=None: runs.append(run))
+    monkeypatch.setattr(generators, "get", lambda name: kind)
+    generators.prepare("constant", SimpleNamespace(task="Push", training_view=lambda: view), "unseen", seed=3)
+    assert [run.seed for run in runs] == [3]
+
+
 def test_an_installed_entry_point_is_a_method(plugin, monkeypatch):
     folder = plugin.parent / "plugin-1.0.dist-info"
     folder.mkdir()
@@ -84,6 +137,9 @@ def test_an_installed_entry_point_is_a_method(plugin, monkeypatch):
         ("no_such_file.py:Thing", "no such file"),
         ("{plugin}:Constan", "did you mean Constant"),
         ("{plugin}:Stranger", "not a subclass"),
+        ("{plugin}:Half", "does not define sample"),
+        ("{plugin}:Undeclared", r"set capabilities = Capabilities\(\) in the class"),
+        ("{plugin}", "names no class; write .*plugin.py:ClassName"),
     ],
 )
 def test_a_wrong_method_gets_an_answer(name, message, plugin):
@@ -94,12 +150,13 @@ def test_a_wrong_method_gets_an_answer(name, message, plugin):
 def test_a_checkpoint_comes_back_for_its_own_task_only(plugin, tmp_path):
     kind = generators.get(f"{plugin}:Constant")
     made = kind()
-    made.task, made.value, made.training = "Push", 2.5, {"steps": 3}
+    made.task, made.value, made.training_facts = "Push", 2.5, {"steps": 3}
     made.save_pretrained(tmp_path / "saved")
     back = kind.from_pretrained(tmp_path / "saved", "Push")
-    assert (back.task, back.value, back.training) == ("Push", 2.5, {"steps": 3})
+    assert (back.task, back.value, back.training_facts) == ("Push", 2.5, {"steps": 3})
     card = (tmp_path / "saved" / "README.md").read_text()
     assert "# Constant for Push" in card and "| steps | 3 |" in card
+    assert "--method plugin.py:Constant" in card and "license" not in card
     with pytest.raises(UserError, match="is for Push, not for Pick"):
         kind.from_pretrained(tmp_path / "saved", "Pick")
     with pytest.raises(UserError, match="is of Constant, not of NNiT"):

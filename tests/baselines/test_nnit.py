@@ -50,6 +50,18 @@ def gaussian_batch(architecture, policies):
     return PolicyBatch(architecture, tuple(torch.randn(policies, *shape) for shape in architecture.block_shapes))
 
 
+def test_a_short_training_leaves_the_first_weights_behind():
+    model = torch.nn.Linear(1, 1, bias=False)
+    mixture = SimpleNamespace(settings=NNiTConfig(), loss=lambda model, data, step, seed: model.weight.sum())
+    trainer = training.Trainer(model, [], mixture, seed=0)
+    torch.nn.init.zeros_(trainer.mean.module.weight)
+    torch.nn.init.ones_(model.weight)
+    trainer.rate = lambda: 0.0
+    for _ in range(100):
+        trainer.advance()
+    assert trainer.mean.module.weight.item() > 0.999
+
+
 # The transformer
 
 

@@ -107,7 +107,7 @@ class Seeded(Generator):
     def __init__(self) -> None:
         super().__init__()
         self.settings = Settings()
-        self.training = {"seed": 7, "seconds": 1}
+        self.training_facts = {"seed": 7, "seconds": 1}
 
     def fit(self, view: TrainingView, run: Run | None = None) -> None:
         pass

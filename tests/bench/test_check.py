@@ -218,6 +218,41 @@ class ComesBackOther(Good):
         return generator
 
 
+class Learns(Good):
+    def fresh(self, architecture, policies, generator):
+        return doctored(super().fresh(architecture, policies, generator), lambda layer: layer.requires_grad_())
+
+
+class OtherTask(Good):
+    def sample_joint(self, policies, seed):
+        draws = torch.Generator().manual_seed(seed)
+        return [self.fresh(Architecture.parse("16-16-32-16", 7, 3), policies, draws)]
+
+
+class ForgetsItsLimits(Good):
+    def fit(self, view, run=None):
+        super().fit(view)
+        self.capabilities = Capabilities(joint=True, widths=(16, 32, 64), depths=(4,), deterministic=False)
+
+    def from_state(config, tensors):
+        generator = ForgetsItsLimits()
+        generator.capabilities = Capabilities(joint=True)
+        return generator
+
+
+class ForgetsWhatItSupports(Good):
+    limit = 64
+
+    def supports(self, architecture):
+        return super().supports(architecture) and max(architecture.hidden) <= self.limit
+
+    @classmethod
+    def from_state(cls, config, tensors):
+        generator = cls()
+        generator.limit = 16
+        return generator
+
+
 class KeepsNothing(Good):
     def tensors(self):
         return Generator.tensors(self)
@@ -248,7 +283,11 @@ class KeepsNothing(Good):
         (Overclaims, "supports 16-16-16-32, but sample answers: not that one"),
         (Underclaims, "it made 24-16-40-24, which it says that it does not support"),
         (DisownsTheZoo, "does not support 64-64-64-64, an architecture that it was fitted on"),
-        (Crashes, "AttributeError"),
+        (Crashes, r"AttributeError.*nonsense.*\(test_check.py, line"),
+        (Learns, r"sample gave layers that require a gradient; sample under torch.inference_mode\(\)"),
+        (OtherTask, "sample_joint gave networks of 7 inputs and 3 outputs, but the task has 42 and 8"),
+        (ForgetsItsLimits, "let from_state narrow them as fit does"),
+        (ForgetsWhatItSupports, "supports answers otherwise for 64-64-64-64"),
         (ComesBackOther, "after save_pretrained and from_pretrained, sample gives other networks"),
         (KeepsNothing, "keeps no checkpoint"),
     ],

@@ -96,12 +96,32 @@ def test_json_is_all_that_stdout_holds(
 def test_a_changed_plug_in_is_run_again(
     call: Call, fresh: Path, plugin: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """So is one with a change in a file beside it that it imports, and only such a one."""
+    beside = plugin.parent / "my_helper.py"
+    beside.write_text("SCALE = 1\n")
+    plugin.write_text("from my_helper import SCALE\n" + plugin.read_text())
     what = ["--task", "Formula-v1", "--episodes", "2", "--policies", "1", "--output", fresh]
     assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
     plugin.write_text(plugin.read_text().replace("torch.zeros", "torch.ones"))
     assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
-    assert "has finished before" not in capsys.readouterr().err
-    assert len(list(fresh.rglob("run.json"))) == 2
+    beside.write_text("SCALE = 2\n")
+    assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
+    assert "had finished before" not in capsys.readouterr().err
+    (plugin.parent / "another.py").write_text("SCALE = 3\n")
+    assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
+    assert "had finished before" in capsys.readouterr().err
+    assert len(list(fresh.rglob("run.json"))) == 3
+
+
+def test_a_crash_in_a_plug_in_does_not_cost_the_others(
+    call: Call, fresh: Path, plugin: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plugin.write_text(plugin.read_text().replace("torch.zeros", "torch.zeroes"))
+    what = ["--task", "Formula-v1", "--episodes", "2", "--policies", "1", "--output", fresh, "--quiet"]
+    assert call("run", "--method", f"{plugin}:Zeros,crop", *what) == 1
+    out, err = capsys.readouterr()
+    assert "crop" in out and f'File "{plugin}", line' in err
+    assert err.splitlines()[-1].endswith("AttributeError: module 'torch' has no attribute 'zeroes'")
 
 
 def test_one_failure_does_not_cost_the_others(

@@ -48,10 +48,12 @@ def builder(monkeypatch):
     monkeypatch.setattr(expert, "EVALUATION_SEEDS", range(2))
     monkeypatch.setattr(PickCube, "scoring_seeds", range(2))
     monkeypatch.setattr(stages, "architectures", few_architectures)
+    forget = tasks.get.cache_clear
 
     def make(folder, task="PickCube-v1"):
         monkeypatch.setattr(stages, "data_folder", lambda name: folder / "data")
         monkeypatch.setattr(task_module, "data_folder", lambda name: folder / "data")
+        forget()  # a task keeps the record that it has read
         if task == "MNIST-PCA32":
             (folder / "data").mkdir(parents=True, exist_ok=True)
             if not (folder / "data" / "task.json").exists():
@@ -63,7 +65,8 @@ def builder(monkeypatch):
             built.expert_config, built.distill_config = TINY_EXPERT, TINY_DISTILL
         return built
 
-    return make
+    yield make
+    forget()
 
 
 def few_architectures(split, inputs, outputs):
@@ -211,7 +214,7 @@ def kill_second_call(monkeypatch, module, name):
 def test_a_stage_without_the_one_before_says_which_to_run(builder, tmp_path):
     with pytest.raises(UserError, match="stage 'expert' first"):
         builder(tmp_path).states()
-    with pytest.raises(UserError, match="stage 'scores' first"):
+    with pytest.raises(UserError, match="stage 'ghns' first"):
         builder(tmp_path).pack()
 
 
@@ -307,11 +310,51 @@ def test_a_worker_that_dies_costs_the_buffer_nothing(tmp_path):
     assert killed.read_bytes() == whole.read_bytes()
 
 
-def test_scores_of_other_seeds_are_made_again(builder, tmp_path):
+def test_scores_of_other_ghns_are_made_again(builder, tmp_path):
+    run_all(builder(tmp_path, "MNIST-PCA32"))
+    shutil.rmtree(tmp_path / "work" / "ghns")
+    better = builder(tmp_path, "MNIST-PCA32")
+    better.config = TINY_FIT.model_copy(update={"steps": 30})
+    better.ghns()
+    with pytest.raises(UserError, match="stage 'scores' first"):
+        better.pack()
+    better.scores()
+    better.pack()
+    materialise(tmp_path / "data", tmp_path / "zoo")
+    zoo = Zoo.open(tmp_path / "zoo")
+    for row in zoo.index.to_pylist():
+        policy = zoo.batch(row["architecture"], row["split"])[row["row"]]
+        played = MNISTPCA32().evaluate([policy], range(100))["return"].to_numpy()
+        assert row["return"] == pytest.approx(played.mean())
+    assert json.loads((tmp_path / "data" / "task.json").read_text())["build"]["ghns"]["steps"] == 30
+
+
+def test_a_build_does_not_go_on_with_other_settings(builder, tmp_path):
+    builder(tmp_path, "MNIST-PCA32").ghns()
+    other = builder(tmp_path, "MNIST-PCA32")
+    other.config = TINY_FIT.model_copy(update={"steps": 30})
+    with pytest.raises(UserError, match="made with other settings"):
+        other.ghns()
+
+
+def test_a_zoo_is_in_place_until_another_is_whole_and_not_replaced_by_a_smaller_one(builder, tmp_path, monkeypatch):
+    run_all(builder(tmp_path, "MNIST-PCA32"))
+    before = artifacts(tmp_path)
+    more = builder(tmp_path, "MNIST-PCA32")
+    more.seeds = range(3)
+    more.ghns()
+    more.scores()
+    assert artifacts(tmp_path) == before
+    monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
+    with pytest.raises(UserError, match="was made by 2 GHNs, and one of 1 would replace it"):
+        stages.build(task="MNIST-PCA32", seeds=1, work=tmp_path)
+
+
+def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
     run_all(builder(tmp_path, "MNIST-PCA32"))
     more = builder(tmp_path, "MNIST-PCA32")
     more.seeds = range(3)
-    with pytest.raises(UserError, match="stage 'scores' first"):
+    with pytest.raises(UserError, match="stage 'ghns' first"):
         more.pack()
     more.ghns()
     more.scores()

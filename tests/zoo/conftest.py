@@ -6,6 +6,7 @@ And a stand-in for the Hub: the endpoints that huggingface_hub uses for data set
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import re
 import threading
@@ -48,7 +49,7 @@ def make_data_folder(folder: Path, task: str = "PickCube-v1", inputs: int = 42, 
             "success_once": 1.0 if robot else None,
             "success_at_end": 0.75 + seed / 512 if robot else None,
             "return": 38.0 if robot else 0.96,
-            "episodes": 64,
+            "episodes": 64 if seed < files.HELDOUT_SEEDS_FROM else 16,
             "passed": (architecture, seed) != DROPPED,
             "kept": (architecture, seed) != DROPPED,
         }
@@ -87,10 +88,13 @@ def home(data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return tmp_path / "home"
 
 
-class Hub(ThreadingHTTPServer):
-    """Data sets in memory. `cut` holds how often an answer with this file breaks off in the middle.
+LARGE = (".safetensors", ".parquet")  # as in the .gitattributes of the Hub's data sets
 
-    While it is `closed`, nobody may write.
+
+class Hub(ThreadingHTTPServer):
+    """Data sets in memory; what git LFS has brought is in `objects` too, by its SHA-256.
+
+    `cut` holds how often an answer with this file breaks off in the middle. While it is `closed`, nobody may write.
     """
 
     daemon_threads = True
@@ -98,6 +102,7 @@ class Hub(ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.files: dict[str, dict[str, bytes]] = {}
+        self.objects: dict[str, bytes] = {}
         self.cut: dict[str, int] = {}
         self.asked: list[str] = []
         self.closed = False
@@ -105,6 +110,11 @@ class Hub(ThreadingHTTPServer):
     @property
     def address(self) -> str:
         return f"http://127.0.0.1:{self.server_port}"
+
+    @property
+    def storage(self) -> str:
+        """Where large files lie: for the client another host, as on the Hub."""
+        return f"http://localhost:{self.server_port}"
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -119,6 +129,8 @@ class Handler(BaseHTTPRequestHandler):
             self.give_repository(match[1], match[2] or "main")
         elif match := re.fullmatch(r"/datasets/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", path):
             self.give_file(match[1], match[3])
+        elif match := re.fullmatch(r"/objects/([^/]+/[^/]+)/(.+)", path):
+            self.give(match[2], self.server.files[match[1]][match[2]], {})
         else:
             self.answer(404, {"error": "no such page"})
 
@@ -137,19 +149,42 @@ class Handler(BaseHTTPRequestHandler):
         elif path == "/api/validate-yaml":
             self.answer(200, {"errors": [], "warnings": []})
         elif match := re.fullmatch(r"/api/datasets/(.+)/preupload/main", path):
-            names = [file["path"] for file in json.loads(body)["files"]]
-            modes = [{"path": name, "uploadMode": "regular", "shouldIgnore": False} for name in names]
+            modes = [
+                {
+                    "path": file["path"],
+                    "uploadMode": "lfs" if file["path"].endswith(LARGE) else "regular",
+                    "shouldIgnore": False,
+                }
+                for file in json.loads(body)["files"]
+            ]
             self.answer(200, {"files": modes})
+        elif path.endswith(".git/info/lfs/objects/batch"):
+            objects = [
+                each | {"actions": {"upload": {"href": f"{self.server.storage}/objects/{each['oid']}"}}}
+                for each in json.loads(body)["objects"]
+            ]
+            self.answer(200, {"transfer": "basic", "objects": objects})
         elif match := re.fullmatch(r"/api/datasets/(.+)/commit/main", path):
             for line in body.splitlines():
                 operation = json.loads(line)
+                value = operation["value"]
                 if operation["key"] == "file":
-                    value = operation["value"]
                     self.server.files[match[1]][value["path"]] = base64.b64decode(value["content"])
+                elif operation["key"] == "lfsFile":
+                    self.server.files[match[1]][value["path"]] = self.server.objects[value["oid"]]
             address = f"{self.server.address}/datasets/{match[1]}/commit/{self.sha}"
             self.answer(200, {"commitUrl": address, "commitOid": self.sha, "hookOutput": ""})
         else:
             self.answer(404, {"error": path})
+
+    def do_PUT(self) -> None:
+        content = self.rfile.read(int(self.headers["Content-Length"]))
+        oid = self.path.removeprefix("/objects/")
+        if hashlib.sha256(content).hexdigest() == oid:
+            self.server.objects[oid] = content
+            self.answer(200, {})
+        else:
+            self.answer(400, {"error": "another checksum"})
 
     def give_repository(self, repository: str, revision: str) -> None:
         if repository not in self.server.files:
@@ -165,33 +200,49 @@ class Handler(BaseHTTPRequestHandler):
         if content is None:
             self.answer(404, {"error": "Entry not found"}, {"X-Error-Code": "EntryNotFound"})
             return
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
+        sha256 = hashlib.sha256(content).hexdigest()
+        headers = {"X-Repo-Commit": self.sha}
+        if name.endswith(LARGE):
+            headers |= {"X-Linked-Etag": f'"{sha256}"', "X-Linked-Size": str(len(content))}
+            place = f"{self.server.storage}/objects/{repository}/{name}"
+            self.answer(302, {}, headers | {"Location": place})
+        else:
+            self.give(name, content, headers | {"ETag": f'"{sha256}"'})
+
+    def give(self, name: str, content: bytes, headers: dict[str, str]) -> None:
+        headers |= {"Content-Length": str(len(content))}
         if self.server.cut.get(name, 0):
             self.server.cut[name] -= 1
             content = content[: len(content) // 2]
             self.close_connection = True
-        self.wfile.write(content)
+        self.send(200, content, headers)
 
     def answer(self, status: int, content: dict[str, Any], headers: dict[str, str] | None = None) -> None:
         body = json.dumps(content).encode()
+        about = {"Content-Type": "application/json", "Content-Length": str(len(body))}
+        self.send(status, body, about | (headers or {}))
+
+    def send(self, status: int, body: bytes, headers: dict[str, str]) -> None:
         self.send_response(status)
-        sent = {"Content-Type": "application/json", "Content-Length": str(len(body))} | (headers or {})
-        for name, value in sent.items():
+        for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(body)
+        if self.command != "HEAD":
+            self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
         return
 
 
 def point_at(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What HF_ENDPOINT does when huggingface_hub is imported."""
+    """What HF_ENDPOINT and HF_HUB_DISABLE_XET do when huggingface_hub is imported.
+
+    With hf_xet, the client would upload by Xet's protocol alone, whatever the Hub answers.
+    """
     template = f"{address}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
     monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", address)
     monkeypatch.setattr(huggingface_hub.constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_XET", True)
 
 
 @contextmanager

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
-from matplotlib.image import imread
 
 from nnit_zoo import export, files
 from nnit_zoo.cli import app, main
+from nnit_zoo.console import print_table
 from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.tasks.mnist import MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
 from nnit_zoo.zoo import Zoo
 
@@ -141,28 +142,56 @@ def test_a_source_with_another_version_does_not_replace_the_zoo(
     assert_error(nnit_zoo("download", "--source", str(zoo_folder)), "another version of the zoo", "--folder")
 
 
+def playing(scores: dict[int, tuple[int, float]]) -> Callable[..., pa.Table]:
+    """In the place of `Task.evaluate`: how many episodes of so many a policy loses, and its mean return."""
+
+    def evaluate(
+        task: object, policies: Sequence[PolicyBatch], seeds: Sequence[int], *, progress: Callable[[int], None]
+    ) -> pa.Table:
+        count, episodes = sum(map(len, policies)), len(seeds)
+        lost, mean = scores[episodes]
+        progress(count * episodes)
+        columns = {
+            "success_once": [1.0] * episodes,
+            "success_at_end": [0.0] * lost + [1.0] * (episodes - lost),
+            "return": [mean] * episodes,
+        }
+        numbers = [number for number in range(count) for _ in seeds]
+        return pa.table({"policy": numbers} | {name: values * count for name, values in columns.items()})
+
+    return evaluate
+
+
 def test_deep_verification_scores_a_sample_anew(nnit_zoo: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     assert nnit_zoo("download")[0] == 0
-    asked: list[int] = []
-    success = [1.0] * 64
+    # the tiny zoo's index says 48 of 64 and a return of 38 for seed 0, 16 of 16 and 38 for seed 128
+    scores = {64: (16, 38.0), 16: (0, 38.0)}
+    monkeypatch.setattr(PickCube, "evaluate", playing(scores))
+    code, stdout, stderr = nnit_zoo("verify", "--deep", "3", "--json")
+    rescored = {row["id"]: row["agrees"] for row in json.loads(stdout)["rescored"]}
+    assert code == 0
+    assert rescored == {
+        "PickCube-v1/32-16-64-32/000": True,
+        "PickCube-v1/64-64-64-32/000": True,
+        "PickCube-v1/16-16-16-32/128": True,
+    }
+    assert "scoring 3 policies: 144 of 144" in stderr
+    scores |= {64: (18, 36.3), 16: (3, 31.0)}  # up to three episodes
+    code, stdout, stderr = nnit_zoo("verify", "--deep", "20")
+    assert code == 0 and "is sound" in stdout and "…" not in stdout
+    assert "scoring 11 policies: 512 of 512" in stderr
+    for wrong in ({16: (4, 38.0)}, {16: (0, 30.0)}):  # more than three
+        monkeypatch.setattr(PickCube, "evaluate", playing(scores | wrong))
+        code, stdout, _ = nnit_zoo("verify", "--deep", "3", "--json")
+        assert json.loads(stdout)["problems"] == ["PickCube-v1/16-16-16-32/128 scores otherwise than the index says"]
+    monkeypatch.setattr(PickCube, "evaluate", playing(scores | {64: (16, 36.0)}))
+    assert_error(nnit_zoo("verify", "--deep", "3"), "PickCube-v1/32-16-64-32/000 scores", "64-64-64-32/000 scores")
 
-    def evaluate(task: object, policies: Sequence[PolicyBatch], seeds: Sequence[int], **_: object) -> pa.Table:
-        asked.append(sum(map(len, policies)))
-        count = asked[-1]
-        columns = {"success_once": [1.0] * 64, "success_at_end": success, "return": [38.0] * 64}
-        return pa.table(
-            {"policy": [i for i in range(count) for _ in seeds]} | {k: v * count for k, v in columns.items()}
-        )
 
-    monkeypatch.setattr(PickCube, "evaluate", evaluate)
-    result = json.loads(nnit_zoo("verify", "--deep", "3", "--json")[1])
-    # the tiny zoo's index says 0.75 for seed 0 and 1.0 for seed 128
-    rescored = {row["id"].removeprefix("PickCube-v1/"): row["agrees"] for row in result["rescored"]}
-    assert rescored == {"32-16-64-32/000": False, "64-64-64-32/000": False, "16-16-16-32/128": True}
-    assert len(result["problems"]) == 2
-    success[:16] = [0.0] * 16
-    assert_error(nnit_zoo("verify", "--deep", "20"), "/128 scores otherwise than the index says")
-    assert asked == [3, 11]
+def test_a_table_cuts_nothing_off(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    print_table(["id", "return"], [["x" * 100, "0.5"]])
+    assert capsys.readouterr().out.count("x") == 100
 
 
 def test_stats_are_printed_beside_the_papers_numbers(nnit_zoo: Command, tmp_path: Path) -> None:
@@ -178,8 +207,7 @@ def test_stats_are_printed_beside_the_papers_numbers(nnit_zoo: Command, tmp_path
     assert rows["nearest L2"]["paper"] == 46.94
     for name in ("magnitudes.png", "pairs.png"):
         assert str(tmp_path / "figures" / name) in stderr
-        pixels = imread(tmp_path / "figures" / name)
-        assert pixels.std() > 0.1
+        assert (tmp_path / "figures" / name).is_file()
     assert "46.940" in nnit_zoo("stats", "--architecture", "32-16-64-32")[1]
     assert_error(nnit_zoo("stats", "--architecture", "64-64-64-32"), "at least two policies")
     assert_error(nnit_zoo("stats", "--architecture", "64-64-64-33"), "64-64-64-3")
@@ -206,7 +234,22 @@ def test_a_full_disk_is_said_without_a_traceback(
     monkeypatch.setattr(export, "write_bytes", full)
     output = str(tmp_path / "policy.safetensors")
     result = nnit_zoo("export", "PickCube-v1/32-16-64-32/001", output)
-    assert_error(result, f"cannot write {output}: No space left on device")
+    assert_error(result, f"cannot read or write {output}: No space left on device")
+
+
+def test_an_output_that_is_something_else_is_said(nnit_zoo: Command, tmp_path: Path) -> None:
+    assert nnit_zoo("download")[0] == 0
+    file, folder, policy = tmp_path / "file", tmp_path / "folder.onnx", "PickCube-v1/32-16-64-32/001"
+    file.touch()
+    folder.mkdir()
+    assert_error(nnit_zoo("export", policy, str(folder)), f"cannot read or write {folder}: Is a directory")
+    for arguments in (
+        ("export", policy, str(file / "policy.onnx")),
+        ("export", "PickCube-v1", str(file)),
+        ("stats", "--architecture", "32-16-64-32", "--output", str(file)),
+    ):
+        assert_error(nnit_zoo(*arguments), f"cannot read or write {file}")
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "folder.onnx", "home"}
 
 
 def test_a_task_without_success_has_no_such_columns(
@@ -220,7 +263,9 @@ def test_a_task_without_success_has_no_such_columns(
     assert json.loads(nnit_zoo("list", "--json")[1])[0]["splits"]["seen"]["success_at_end"] is None
     assert "| MNIST-PCA32 | seen | 2 | 3 |  | 0.96 |" in nnit_zoo("card")[1]
     assert nnit_zoo("download", "--task", "MNIST-PCA32")[0] == 0
-    assert nnit_zoo("verify", "--task", "MNIST-PCA32")[0] == 0
+    for score, code in ((0.96, 0), (0.9601, 2)):  # one of 10,000 digits: what is not simulated is exact
+        monkeypatch.setattr(MNISTPCA32, "evaluate", playing({64: (0, score), 16: (0, score)}))
+        assert nnit_zoo("verify", "--task", "MNIST-PCA32", "--deep", "3")[0] == code
 
 
 def test_completion_knows_the_commands() -> None:
@@ -234,8 +279,11 @@ def test_completion_knows_the_commands() -> None:
         (("download", "--revision", "v1"), ("--source",)),
         (("download", "--split", "unsen"), ("unseen",)),
         (("download", "--task", "PickCub-v1"), ("PickCub-v1", "did you mean PickCube-v1?")),
+        (("download", "--task", "PushCube-v1"), ("build it with: nnit-zoo build --task PushCube-v1",)),
+        (("show", "PushCube-v1"), ("build it with: nnit-zoo build --task PushCube-v1",)),
         (("show", "--architecture", "32-16-64-33"), ("did you mean", "32-16-64-32")),
         (("download", "--fodler", "x"), ("--fodler", "--folder")),
+        (("verify", "--deep", "-1"), ("--deep", "-1", ">= 0")),
         (("verify", "--folder", "nowhere"), ("no zoo of PickCube-v1 in nowhere", "--folder nowhere")),
     ],
 )

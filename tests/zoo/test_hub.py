@@ -26,7 +26,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def nnit_zoo(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own: huggingface_hub reads its environment once, when it is imported."""
     code = "from nnit_zoo.cli import main; main()"
-    variables = os.environ | {"NO_PROXY": "127.0.0.1"} | environment
+    variables = os.environ | {"NO_PROXY": "127.0.0.1,localhost"} | environment
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, env=variables, check=False
     )
@@ -38,6 +38,7 @@ def test_the_hub_gives_the_bytes_that_the_ghns_give(hub, made_once: Path, tmp_pa
     Source(address, "PickCube-v1", revision="main").fetch(tmp_path / "zoo", finished.append)
     assert contents(tmp_path / "zoo") == contents(made_once)
     assert sum(finished) == 4
+    assert f"/objects/someone/zoo/{SHARD}" in hub.asked  # a redirect was followed
     hub.asked.clear()
     Source(address, "PickCube-v1").fetch(tmp_path / "zoo")
     assert not any(path.endswith("safetensors") for path in hub.asked)
@@ -130,6 +131,8 @@ def test_what_is_pushed_can_be_downloaded(hub, made_once: Path, tmp_path: Path) 
     card.write_dataset(tmp_path / "set", [Zoo.open(made_once)], "someone/new")
     assert hub.address in push("someone/new", tmp_path / "set")
     assert "someone/new" in hub.files["someone/new"]["README.md"].decode()
+    large = {path.read_bytes() for path in (tmp_path / "set").rglob("*") if path.suffix in (".safetensors", ".parquet")}
+    assert set(hub.objects.values()) == large
     Source("someone/new", "PickCube-v1").fetch(tmp_path / "zoo")
     assert contents(tmp_path / "zoo") == contents(made_once)
 

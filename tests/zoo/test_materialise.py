@@ -21,6 +21,7 @@ from safetensors.torch import load_file, save_file
 
 from nnit_zoo import files
 from nnit_zoo.architecture import Architecture
+from nnit_zoo.atomic import write_atomically, write_bytes
 from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import Entry, Manifest
@@ -76,6 +77,15 @@ def test_an_index_of_before_these_columns_is_still_read(zoo_folder: Path) -> Non
     (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
     assert verify(zoo_folder) == []
     assert Zoo.open(zoo_folder).index["weight_norm"].null_count == len(older)
+
+
+def test_two_writers_of_a_file_with_the_same_process_number_do_not_meet(tmp_path: Path) -> None:
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(b"first")
+        write_bytes(tmp_path / "x", b"second")
+
+    write_atomically(tmp_path / "x", write)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"first"]
 
 
 def test_two_processes_at_once_leave_one_sound_zoo(data_folder: Path, zoo_folder: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 
@@ -45,8 +46,10 @@ def test_module_computes_what_the_batch_computes() -> None:
     batch = random_batch()
     observations = torch.randn(len(batch), 10, 6, generator=torch.Generator().manual_seed(1))
     outputs = batch(observations)
+    state = torch.get_rng_state()
     for index in range(len(batch)):
         torch.testing.assert_close(batch.to_module(index)(observations[index]), outputs[index])
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_module_with_folded_standardisation_takes_raw_observations() -> None:
@@ -63,6 +66,9 @@ def test_batches_are_cut_and_joined() -> None:
     batch = random_batch()
     again = concatenate([batch[0], batch[1:3], batch[[3]]])
     assert torch.equal(again.flat(), batch.flat())
+    for index in (3, np.int64(3), torch.tensor(3), np.array([3]), torch.arange(4) == 3):
+        assert torch.equal(batch[index].flat(), batch.flat()[3:])
+    assert torch.equal(batch[:1][torch.tensor([True])].flat(), batch.flat()[:1])  # a mask, not an index
     assert [len(single) for single in batch] == [1, 1, 1, 1]
     assert batch.flat().shape == (4, ARCHITECTURE.parameters)
     other = Architecture(6, (2,), 3)

@@ -6,19 +6,24 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from matplotlib.figure import Figure
 
-from nnit_zoo import files, stats
+from nnit_zoo import diversity, files, stats
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.cli import main
 from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.zoo import Zoo
+
+SMALL = Architecture(6, (16, 16), 3)
 
 
-def aligned(count: int) -> PolicyBatch:
+def aligned(count: int, architecture: Architecture = SMALL) -> PolicyBatch:
     """Networks whose weights differ in nothing but their signs."""
-    architecture, draw = Architecture(6, (16, 16), 3), torch.Generator().manual_seed(0)
+    draw = torch.Generator().manual_seed(0)
     layers = []
     for shape in architecture.block_shapes:
         signs = torch.randint(2, (count, *shape), generator=draw) * 2 - 1
@@ -33,6 +38,40 @@ def test_a_population_is_measured_by_its_scores_distances_and_layers() -> None:
     assert found["|W| r, layer 1"] == pytest.approx(1) and found["|W| r, layers 2+"] == pytest.approx(1)
     assert abs(found["nearest cosine"]) < 0.2
     assert 0 < found["CKA, mean"] == pytest.approx((found["CKA, layer 1"] + found["CKA, layer 2"]) / 2)
+
+
+def test_permuting_the_neurons_takes_the_correlation_away(made_once: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    zoo, architecture = Zoo.open(made_once), Architecture(42, (32, 16, 64, 32), 8)
+    monkeypatch.setattr(zoo, "architectures", lambda split: (architecture,))
+    monkeypatch.setattr(zoo, "batch", lambda architecture, split: aligned(12, architecture))
+    monkeypatch.setattr(zoo, "ghn_seeds", lambda architecture, split: tuple(range(12)))
+    rows = {row["measure"]: row for row in stats.analyse(zoo, [architecture])}
+    assert rows["|W| r, layers 2+"]["all seen"] == pytest.approx(1)
+    permuted = rows["|W| r, permuted"]
+    assert permuted["32-16-64-32"] == permuted["all seen"] == pytest.approx(0, abs=0.1)
+    assert permuted["paper"] == 0
+
+
+def test_figures_show_the_measures(made_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    zoo = Zoo.open(made_once)
+    monkeypatch.setattr(zoo, "batch", lambda architecture, split: aligned(12, architecture))
+    drawn: list[Figure] = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *rest, **how: drawn.append(self) or save(self, *rest, **how))
+    chosen = [zoo.parse("32-16-64-32"), zoo.parse("64-64-64-32")]
+    assert [path.read_bytes()[:4] for path in stats.draw(zoo, chosen, tmp_path)] == [b"\x89PNG"] * 2
+    magnitudes, pairs = drawn
+
+    maps = [axes.images[0].get_array() for axes in magnitudes.axes]
+    expected = [profile for each in chosen for profile in diversity.magnitudes(aligned(12, each))]
+    for shown, profile in zip(maps, expected, strict=True):
+        np.testing.assert_array_equal(shown, profile)
+    for axes, measure in zip(pairs.axes, (diversity.distances, diversity.cosines), strict=True):
+        for outline, each in zip(axes.patches, chosen, strict=True):
+            values = diversity.pairs(measure(aligned(12, each))).numpy()
+            edges = outline.get_xy()[:, 0]
+            np.testing.assert_allclose([edges.min(), edges.max()], [values.min(), values.max()])
+    assert [text.get_text() for text in pairs.axes[1].get_legend().get_texts()] == [str(each) for each in chosen]
 
 
 def test_twins_are_shown_beside_the_paper_or_the_command_is_named(

@@ -59,6 +59,10 @@ def test_the_training_view_holds_seen_policies_of_training_seeds_only(zoo_folder
     first, second = view.architectures
     assert (view.ghn_seeds(first), view.ghn_seeds(second)) == ((0, 1), (0,))
     assert view.batch(first).layers[0].dtype == torch.float32
+    assert torch.equal(view.batch("32-16-64-32").flat(), view.batch(first).flat())
+    assert view.ghn_seeds("64-64-64-32") == (0,)
+    with pytest.raises(UserError, match="did you mean 32-16-64-32"):
+        view.batch("32-16-64-33")
     for text in ("16-16-16-32", "32-16-16-16"):
         with pytest.raises(UserError, match="never for training"):
             view.batch(Architecture.parse(text, 42, 8))

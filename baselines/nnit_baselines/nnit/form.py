@@ -49,8 +49,7 @@ class Form:
         """The networks with parameters of standard deviation one (NNiT, appendix D).
 
         The paper divides all by one number. With `fan_in_scaling`, biases have their own, and weights have one size at
-        every fan-in: otherwise a neuron's weights change size with the width before it, and the distance to the zoo
-        after equal training is a sixth larger (docs/nnit.md).
+        every fan-in: otherwise a neuron's weights change size with the width before it (docs/deviations.md).
         """
         return self._scaled(batch, backwards=False)
 

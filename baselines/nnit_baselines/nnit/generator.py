@@ -26,9 +26,9 @@ class NNiT(Generator):
     """Diffusion transformer over architecture tokens and weight patches: p(w | a) and p(a, w) (NNiT 5)."""
 
     capabilities = Capabilities(joint=True)
+    licence = "cc-by-4.0"
 
     def __init__(self, settings: NNiTConfig | None = None) -> None:
-        super().__init__()
         self.settings = settings or NNiTConfig()
         self.form: Form
         self.model: Transformer
@@ -53,7 +53,7 @@ class NNiT(Generator):
             torch.manual_seed(run.seed)  # only the initial weights; a step's batch has a generator of its own
             self._take(Form.of(view, fan_in_scaling=self.settings.fan_in_scaling))
         data = [Packed.of(view.batch(each), self.form, self.settings) for each in view.architectures]
-        self.training = training.train(self.model, data, self.mixture, run)
+        self.training_facts = training.train(self.model, data, self.mixture, run)
         self._restore(self.tensors())
 
     def sample(self, request: SampleRequest) -> PolicyBatch:

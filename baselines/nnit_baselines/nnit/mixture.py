@@ -133,7 +133,12 @@ class PackedMixture(Mixture):
         """Patches of networks of an architecture."""
         where = Places.of(architecture, self.form, self.settings)
         noise = torch.randn(count, *where.mask.shape, generator=generator) * where.mask
-        return self._draw(lambda noisy, level: self._weights(model, where, noisy, level) * where.mask, noise, generator)
+
+        def denoise(noisy: Tensor, level: Tensor) -> Tensor:
+            # Steps that add fresh noise add it where there is no parameter too; in training that is always 0.
+            return self._weights(model, where, noisy * where.mask, level) * where.mask
+
+        return self._draw(denoise, noise, generator)
 
     def sample_joint(self, model: Transformer, count: int, generator: torch.Generator) -> dict[Architecture, Tensor]:
         """Architectures first, then weights for each."""

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 
 from nnit_baselines.generator import Run
 from nnit_baselines.nnit.mixture import Mixture, Packed
@@ -37,7 +40,7 @@ class Trainer:
         self.seconds = 0.0
         betas = (0.9, settings.beta2)
         self.optimiser = torch.optim.AdamW(model.parameters(), lr=0.0, betas=betas, weight_decay=0.0, fused=True)
-        self.mean = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(settings.ema))  # type: ignore[no-untyped-call]
+        self.mean = AveragedModel(model, multi_avg_fn=self._average)
 
     def advance(self) -> float:
         """One optimiser step; returns the loss."""
@@ -52,6 +55,12 @@ class Trainer:
         self.mean.update_parameters(self.model)
         self.step += 1
         return loss.item()
+
+    @torch.no_grad()
+    def _average(self, means: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:
+        """Move the running means; they reach back a tenth of a short training, or the first weights would stay in."""
+        decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
+        torch._foreach_lerp_(list(means), list(weights), 1 - decay)
 
     def rate(self) -> float:
         """The learning rate of this step."""
@@ -93,8 +102,12 @@ class Trainer:
 
     def load(self, path: Path) -> None:
         """Go on from a state; raises UserError if it is of another training."""
-        state = torch.load(path, weights_only=True)
-        if state["identity"] != self.identity():
+        try:
+            state = torch.load(path, weights_only=True)
+            identity = state["identity"]
+        except (RuntimeError, KeyError, TypeError, EOFError, UnpicklingError):
+            raise UserError(f"{path} is damaged, or no state of a training; delete it to start anew") from None
+        if identity != self.identity():
             raise UserError(
                 f"{path} is the state of a training with other settings, seed or data; "
                 "repeat those, or delete the file to start anew"
