@@ -1,6 +1,5 @@
 """Checkpoints on the Hub, against the local stand-in that the zoo's tests use."""
 
-import hashlib
 import importlib.util
 import re
 from pathlib import Path
@@ -38,16 +37,6 @@ class ModelHandler(stand_in.Handler):
     def as_data_set(self):
         path = re.sub("^/api/models/", "/api/datasets/", self.path)
         return re.sub("^/([^/]+/[^/]+)/resolve/", r"/datasets/\1/resolve/", path)
-
-    def give_file(self, repository, name):
-        content = self.server.files[repository][name]
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("ETag", hashlib.sha256(content).hexdigest())
-        self.send_header("X-Repo-Commit", self.sha)
-        self.end_headers()
-        if self.command == "GET":
-            self.wfile.write(content)
 
 
 @pytest.fixture
