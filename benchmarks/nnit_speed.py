@@ -1,7 +1,7 @@
 """NNiT's training and sampling speed: only patches with parameters as tokens, beside the padded grid of the paper.
 
-Both transformers have the same sizes; the padded one, plain, takes all 5 x 4 x 5 patches of every network, as FiT pads. Tokens
-are counted alike: patches that hold parameters. One thread, seconds of processor time.
+Both transformers have the same sizes; the padded one, plain, takes all 5 x 4 x 5 patches of every network, as FiT pads
+images. Tokens are counted alike: patches that hold parameters. One thread, seconds of processor time.
 
 Run: OMP_NUM_THREADS=1 python benchmarks/nnit_speed.py [--rounds 1]
 """
