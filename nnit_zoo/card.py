@@ -98,6 +98,7 @@ With the `nnit` package: `nnit-zoo download --task {task} --source {repository}`
 | `parameters` | weights and biases |
 
 `<task>/*.safetensors` hold the same weights stacked per architecture, and `index.parquet` says where each policy is.
+`<task>/build/`, where a task has it, holds the hypernetworks, the expert, and the scores of all candidates, kept or not.
 
 ## Licence
 
@@ -137,10 +138,14 @@ def readme(indexes: Sequence[tuple[files.Manifest, pa.Table]], repository: str =
     return f"---\n{header.to_yaml()}\n---\n{text}"
 
 
+ORIGINS = ("expert.safetensors", "ghns.safetensors", files.SELECTION, "scores.parquet")
+
+
 def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> None:
     """Write the zoos to `folder` as a data set: per task its files, task.json and policies/<split>.parquet.
 
-    Raises UserError if a zoo lacks a shard.
+    A zoo that is the one embedded here also gets what it was made from, and all candidates' scores, in build/. Raises
+    UserError if a zoo lacks a shard.
     """
     for zoo in zoos:
         place = folder / zoo.task
@@ -149,6 +154,11 @@ def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> 
         for name in (*zoo.manifest.files, files.MANIFEST):
             write_atomically(place / name, partial(shutil.copyfile, zoo.folder / name))
         write_json(place / "task.json", tasks.get(zoo.task).record)
+        embedded = files.EMBEDDED / zoo.task
+        if (embedded / files.MANIFEST).is_file() and files.Manifest.read(embedded) == zoo.manifest:
+            for origin in (embedded / name for name in ORIGINS):
+                if origin.is_file():  # MNIST-PCA32 has no expert
+                    write_atomically(place / "build" / origin.name, partial(shutil.copyfile, origin))
         for split in files.summary(zoo.index):
             write_atomically(folder / _path(zoo.task, split), partial(_write_policies, zoo, split))
     indexes = [(zoo.manifest, zoo.index) for zoo in zoos]

@@ -16,7 +16,7 @@ from datasets import load_dataset
 from safetensors import safe_open
 from safetensors.torch import load_file
 
-from nnit_zoo import card, tasks
+from nnit_zoo import card, files, tasks
 from nnit_zoo.errors import UserError
 from nnit_zoo.export import export
 from nnit_zoo.materialise import materialise
@@ -42,6 +42,18 @@ def raw() -> torch.Tensor:
     task = tasks.get("PickCube-v1")
     draws = np.random.default_rng(0).normal(size=(7, 42))
     return torch.from_numpy((task.observation_mean + task.observation_std * draws).astype(np.float32))
+
+
+def test_a_data_set_holds_every_candidates_scores(
+    data_folder: Path, made_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card.write_dataset(tmp_path / "another", [Zoo.open(made_once)])
+    assert not (tmp_path / "another" / "PickCube-v1" / "build").exists()
+    monkeypatch.setattr(files, "EMBEDDED", data_folder.parent)
+    card.write_dataset(tmp_path / "ours", [Zoo.open(made_once)])
+    for name in ("ghns.safetensors", "selection.parquet"):
+        copy = tmp_path / "ours" / "PickCube-v1" / "build" / name
+        assert copy.read_bytes() == (data_folder / name).read_bytes()
 
 
 def test_a_policy_is_the_state_of_a_plain_module(made_once: Path, tmp_path: Path, raw: torch.Tensor) -> None:
