@@ -98,7 +98,7 @@ With the `nnit` package: `nnit-zoo download --task {task} --source {repository}`
 | `parameters` | weights and biases |
 
 `<task>/*.safetensors` hold the same weights stacked per architecture, and `index.parquet` says where each policy is.
-`<task>/build/`, where a task has it, holds the hypernetworks, the expert, and the scores of all candidates, kept or not.
+`<task>/build/`, where a task has it, holds the hypernetworks, the expert, and the scores of all candidates.
 
 ## Licence
 
