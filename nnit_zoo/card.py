@@ -138,9 +138,6 @@ def readme(indexes: Sequence[tuple[files.Manifest, pa.Table]], repository: str =
     return f"---\n{header.to_yaml()}\n---\n{text}"
 
 
-ORIGINS = ("expert.safetensors", "ghns.safetensors", files.SELECTION, "scores.parquet")
-
-
 def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> None:
     """Write the zoos to `folder` as a data set: per task its files, task.json and policies/<split>.parquet.
 
@@ -156,9 +153,9 @@ def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> 
         write_json(place / "task.json", tasks.get(zoo.task).record)
         embedded = files.EMBEDDED / zoo.task
         if (embedded / files.MANIFEST).is_file() and files.Manifest.read(embedded) == zoo.manifest:
-            for origin in (embedded / name for name in ORIGINS):
-                if origin.is_file():  # MNIST-PCA32 has no expert
-                    write_atomically(place / "build" / origin.name, partial(shutil.copyfile, origin))
+            for name in (files.EXPERT, files.GHNS, files.SELECTION, files.CANDIDATE_EPISODES):
+                if (embedded / name).is_file():  # MNIST-PCA32 has no expert
+                    write_atomically(place / "build" / name, partial(shutil.copyfile, embedded / name))
         for split in files.summary(zoo.index):
             write_atomically(folder / _path(zoo.task, split), partial(_write_policies, zoo, split))
     indexes = [(zoo.manifest, zoo.index) for zoo in zoos]

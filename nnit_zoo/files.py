@@ -33,7 +33,10 @@ Progress = Callable[[int], None]
 EMBEDDED = Path(__file__).parent / "data"
 INDEX = "index.parquet"
 MANIFEST = "manifest.json"
+EXPERT = "expert.safetensors"
+GHNS = "ghns.safetensors"
 SELECTION = "selection.parquet"
+CANDIDATE_EPISODES = "scores.parquet"
 HELDOUT_SEEDS_FROM = 128
 INDEX_SCHEMA = pa.schema(
     [

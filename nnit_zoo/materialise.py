@@ -30,11 +30,10 @@ from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_bytes
 from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import HELDOUT_SEEDS_FROM, SPLITS, Entry, Manifest, Progress
+from nnit_zoo.files import GHNS, HELDOUT_SEEDS_FROM, SPLITS, Entry, Manifest, Progress
 from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.zoo import policy_hashes
 
-GHNS = "ghns.safetensors"
 TIE_MARGIN = 1e-14
 _MOST_TIES = 8  # of one policy that are tried on both sides
 
@@ -71,11 +70,10 @@ def materialise(
     )
 
 
-def write_manifest(data_folder: Path, standardisation: str | None = None) -> None:
+def write_manifest(data_folder: Path, standardisation: str | None) -> None:
     """Write index.parquet and manifest.json beside the GHNs and the selection table that they follow from.
 
-    The manifest keeps `standardisation`, the hash of what the policies' observations are standardised by.
-
+    The manifest keeps `standardisation`, the hash of what the policies' observations are standardised by, or None.
     Raises UserError if a kept policy has a parameter that is not finite in float16.
     """
     source = _Source(data_folder)

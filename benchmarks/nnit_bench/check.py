@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import random
 import sys
@@ -303,20 +304,18 @@ def _comes_back(subject: Subject) -> None:
 def _problem(clause: Clause, subject: Subject) -> str | None:
     try:
         clause.attempt(subject)
-    except Broken as broken:
-        return str(broken)
+    except (Broken, UserError) as told:
+        return str(told)
     except Exception as error:  # the method's own, which may fail in any way
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        where = f" ({Path(last.filename).name}, line {last.lineno})"
-        return f"{type(error).__name__}: {error}{where}"
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame for frame in frames if frame.filename == inspect.getfile(subject.kind)]
+        last = (own or frames)[-1]  # in the method's file, if it got there, and not in a library that it calls
+        return f"{type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno})"
     return None
 
 
 def _check_batch(name: str, batch: PolicyBatch) -> None:
-    try:
-        check_batch(name, batch)
-    except UserError as error:
-        raise Broken(str(error)) from None
+    check_batch(name, batch)
     if not batch.finite().all():
         raise Broken(f"{name} gave networks of {batch.architecture} with NaN or infinite parameters")
 

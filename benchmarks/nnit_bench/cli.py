@@ -158,11 +158,11 @@ def run(*, what: What = DEFAULT_WHAT, how: How = DEFAULT_HOW) -> None:
                 try:
                     entrant = runner.enter(name, zoo, protocol, checkpoint=what.checkpoint, steps=what.steps)
                     outcomes.append(runner.run(task, zoo, entrant, protocol, execution))
-                except Exception as error:  # the others' work should not be lost to it
-                    if not isinstance(error, UserError):
-                        traceback.print_exc()
-                    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-                    errors.append(f"{name} on {protocol.task}, {protocol.split}: {text}")
+                except UserError as error:  # the others' work should not be lost to it
+                    errors.append(f"{name} on {protocol.task}, {protocol.split}: {error}")
+                except Exception as error:  # nor to a crash, whose place its author needs
+                    traceback.print_exc()
+                    errors.append(f"{name} on {protocol.task}, {protocol.split}: {type(error).__name__}: {error}")
             results.append(tables.Results(protocol, outcomes, runner.zoo_row(zoo.index, protocol)))
     if how.as_json:
         print_json({"tables": [tables.plain(each) for each in results], "errors": errors})

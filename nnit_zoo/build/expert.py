@@ -18,6 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from nnit_zoo.atomic import write_atomically, write_json
+from nnit_zoo.files import EXPERT
 from nnit_zoo.parallel import in_chunks
 from nnit_zoo.sim.rollout import Episodes, rollout
 from nnit_zoo.sim.tabletop import Array
@@ -54,11 +55,11 @@ class ExpertConfig(BaseModel):
     stop_return: float = 39.0
 
 
-CONFIGS = {
+CONFIG_BY_TASK = {
     "PushCube-v1": ExpertConfig(stop_success=0.98, stop_return=42.0),
     "StackCubeEasy-v1": ExpertConfig(stop_success=0.95, stop_return=38.0, total_steps=12_000_000),
 }
-"""Of tasks whose expert stops at other scores than PickCube-v1's, or learns for longer."""
+"""For tasks whose expert stops at other scores than PickCube-v1's, or may learn for longer."""
 
 
 class ActorCritic(nn.Module):
@@ -252,7 +253,7 @@ def train(
             lines.write(json.dumps(entry) + "\n")
         if scores["return"] > training.best_return:
             training.best_return = scores["return"]
-            save(network, folder / "expert.safetensors")
+            save(network, folder / EXPERT)
             record = entry
             write_json(folder / "record.json", record)
         training.save(folder / "state.pt")

@@ -12,7 +12,7 @@ import json
 import shutil
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -33,11 +33,12 @@ from nnit_zoo.build import expert as experts
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.ghn import GHN
+from nnit_zoo.build.selection import SELECTION_SCHEMA, is_yardstick, select
 from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import HELDOUT_SEEDS_FROM, SELECTION, ghns_of
-from nnit_zoo.materialise import GHNS, stored, write_manifest
+from nnit_zoo.files import CANDIDATE_EPISODES, EXPERT, GHNS, SELECTION, ghns_of
+from nnit_zoo.materialise import stored, write_manifest
 from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.provenance import commit
@@ -47,22 +48,8 @@ from nnit_zoo.tasks.robot import RobotPolicyTask
 from nnit_zoo.tasks.task import PROBE, Task, data_folder
 
 Stage = Literal["all", "expert", "states", "features", "ghns", "scores", "pack", "twins"]
-POLICIES_PER_ARCHITECTURE = 100
 PROBE_STATES = 2000
 STD_FLOOR = 0.05  # keeps near-constant observations from being blown up; decides the weight error policies survive
-SELECTION_SCHEMA = pa.schema(
-    [
-        ("architecture", pa.string()),
-        ("ghn_seed", pa.int64()),
-        ("split", pa.string()),
-        ("success_once", pa.float64()),
-        ("success_at_end", pa.float64()),
-        ("return", pa.float64()),
-        ("episodes", pa.int64()),
-        ("passed", pa.bool_()),
-        ("kept", pa.bool_()),
-    ]
-)
 
 
 def build(
@@ -91,14 +78,16 @@ def build(
     """
     torch.set_num_threads(1)
     chosen = tasks.get(task)
+    if workers < 1 or (seeds is not None and seeds < 1):
+        raise UserError("--workers and --seeds must be 1 or more")
     shipped = data_folder(task) / SELECTION
-    count = ghns_of(shipped) if shipped.exists() else 16
-    if seeds is not None and shipped.exists() and seeds < count:
+    least = ghns_of(shipped) if shipped.exists() else 0
+    seeds = seeds or least or 16
+    if seeds < least:
         raise UserError(
-            f"the zoo of {task} in {shipped.parent} was made by {count} GHNs, and one of {seeds} would replace it; "
+            f"the zoo of {task} in {shipped.parent} was made by {least} GHNs, and one of {seeds} would replace it; "
             "move it elsewhere first if that is meant"
         )
-    seeds = count if seeds is None else seeds
     builder: Builder
     if isinstance(chosen, RobotPolicyTask) and source is None:
         require_simulator()
@@ -109,8 +98,6 @@ def build(
     else:
         raise UserError(f"--source is not for {task}" if source else f"this command cannot build {task}")
     known = (*builder.stages, *builder.analyses)
-    if workers < 1 or (seeds is not None and seeds < 1):
-        raise UserError("--workers and --seeds must be 1 or more")
     if stage not in ("all", *known):
         raise UserError(f"building {task} has no stage '{stage}': there are {', '.join(known)}")
     for name in builder.stages if stage == "all" else (stage,):
@@ -215,7 +202,7 @@ class Builder(ABC):
         note = {"nnit": json.dumps({"task": self.task.name, **sizes, "ghn_seeds": list(self.seeds)})}
         write_atomically(self.data / GHNS, lambda temporary: save_file(stacked, temporary, note))
         write_atomically(
-            self.data / "scores.parquet",
+            self.data / CANDIDATE_EPISODES,
             lambda temporary: pq.write_table(pa.concat_tables(tables), temporary, compression="zstd"),
         )
         write_atomically(
@@ -264,7 +251,7 @@ class Builder(ABC):
             raise UserError(f"{path.parent} was made with other settings, as {path.name} there says; move it elsewhere")
         if works and (now := str(commit())) not in made["commits"]:
             made["commits"].append(now)
-            write_json(path, made)
+        write_json(path, made)
 
     @property
     def _units(self) -> Path:
@@ -291,16 +278,16 @@ class RobotBuilder(Builder):
     ) -> None:
         super().__init__(task, work, seeds, workers, parallel)
         self.task: RobotPolicyTask = task
-        self.expert_config = experts.CONFIGS.get(task.name, ExpertConfig())
+        self.expert_config = experts.CONFIG_BY_TASK.get(task.name, ExpertConfig())
         self.distill_config, self.twins_config = DistillConfig(), TwinsConfig()
 
     def expert(self) -> None:
         """Train the expert, then fix the task's standardisation from the states that it visits."""
-        if (self.data / "expert.safetensors").exists():
+        if (self.data / EXPERT).exists():
             log("expert: done")
             return
         record = experts.train(self.task, self.expert_config, self.work / "expert", self.workers, log)
-        network = experts.load(self.work / "expert" / "expert.safetensors")
+        network = experts.load(self.work / "expert" / EXPERT)
         episodes = experts.play(self.task, network, experts.EVALUATION_SEEDS)
         states = episodes.observations.reshape(-1, self.task.inputs).astype(np.float64)
         write_json(
@@ -315,7 +302,7 @@ class RobotBuilder(Builder):
         )
         probe = torch.from_numpy(states[np.arange(PROBE_STATES) * len(states) // PROBE_STATES]).half()
         write_atomically(self.data / PROBE, lambda temporary: save_file({"states": probe}, temporary))
-        experts.save(network, self.data / "expert.safetensors")
+        experts.save(network, self.data / EXPERT)
         log(f"expert: {json.dumps(record)}")
         if not experts.good_enough(self.expert_config, record):
             log("expert: it is below the scores to stop at; its students can only be worse")
@@ -371,7 +358,7 @@ class RobotBuilder(Builder):
         return self.work / "states" / "states.safetensors"
 
     def _expert(self) -> experts.Network:
-        path = self.data / "expert.safetensors"
+        path = self.data / EXPERT
         if not path.exists():
             raise UserError(f"{self.task.name} has no expert yet; run the stage 'expert' first")
         return experts.load(path)
@@ -409,40 +396,3 @@ class MNISTBuilder(Builder):
     def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
         """Cross entropy on the training digits; there is no expert."""
         return partial(mnist.train_ghn, self.config), {**self.config.model_dump(), "digits": 60_000}
-
-
-def is_yardstick(split: str, ghn_seed: int) -> bool:
-    """Whether a policy of this split's architectures is for comparison only, and so never in the corpus."""
-    return split != "seen" or ghn_seed >= HELDOUT_SEEDS_FROM
-
-
-def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Iterator[dict[str, Any]]:
-    """The selection rows of one architecture's candidates, by GHN seed.
-
-    Of a seen architecture, the best 100 that reach all thresholds are kept; the best by the first threshold's metric,
-    then the next (NNiT appendix C). Of a reference architecture, and of held-out seeds, all are kept: they are a
-    yardstick, which a filter would bend.
-    """
-    columns = ("success_once", "success_at_end", "return")
-    means = scores.group_by("ghn_seed").aggregate([*((column, "mean") for column in columns), ("seed", "count")])
-    candidates = sorted(
-        means.to_pylist(), key=lambda row: (*(-row[f"{column}_mean"] for column in task.thresholds), row["ghn_seed"])
-    )
-    reference = [row["ghn_seed"] for row in candidates if is_yardstick(split, row["ghn_seed"])]
-    passing = [
-        row["ghn_seed"]
-        for row in candidates
-        if all(row[f"{column}_mean"] >= least for column, least in task.thresholds.items())
-    ]
-    corpus = [seed for seed in passing if seed not in reference][:POLICIES_PER_ARCHITECTURE]
-    kept = {*reference, *corpus}
-    for row in sorted(candidates, key=lambda row: row["ghn_seed"]):
-        yield {
-            "architecture": architecture,
-            "ghn_seed": row["ghn_seed"],
-            "split": split,
-            **{column: row[f"{column}_mean"] for column in columns},
-            "episodes": row["seed_count"],
-            "passed": row["ghn_seed"] in passing,
-            "kept": row["ghn_seed"] in kept,
-        }

@@ -170,7 +170,7 @@ def embed_zoo(folder: Path, task: Task, seeds: Sequence[int], splits: dict[str, 
         for seed in seeds
     ]
     pq.write_table(pa.Table.from_pylist(rows), folder / "selection.parquet")
-    write_manifest(folder)
+    write_manifest(folder, None)
     return folder
 
 

@@ -218,6 +218,11 @@ class ComesBackOther(Good):
         return generator
 
 
+class CrashesInTorch(Good):
+    def sample(self, request):
+        return torch.nn.Linear(2, 2)(torch.zeros(1, 3))
+
+
 class Learns(Good):
     def fresh(self, architecture, policies, generator):
         return doctored(super().fresh(architecture, policies, generator), lambda layer: layer.requires_grad_())
@@ -284,6 +289,7 @@ class KeepsNothing(Good):
         (Underclaims, "it made 24-16-40-24, which it says that it does not support"),
         (DisownsTheZoo, "does not support 64-64-64-64, an architecture that it was fitted on"),
         (Crashes, r"AttributeError.*nonsense.*\(test_check.py, line"),
+        (CrashesInTorch, r"RuntimeError: mat1.*\(test_check.py, line"),
         (Learns, r"sample gave layers that require a gradient; sample under torch.inference_mode\(\)"),
         (OtherTask, "sample_joint gave networks of 7 inputs and 3 outputs, but the task has 42 and 8"),
         (ForgetsItsLimits, "let from_state narrow them as fit does"),

@@ -10,14 +10,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
 
 from nnit_zoo import stats, tasks
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.build import distill, expert, mnist, stages, twins
+from nnit_zoo.build import distill, expert, mnist, selection, stages, twins
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.fit import Fit
@@ -261,7 +260,7 @@ def test_a_wide_canvas_is_made_by_more_blocks_and_fills_wide_layers():
 
 
 def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_path, monkeypatch):
-    monkeypatch.setattr(stages, "HELDOUT_SEEDS_FROM", 1)
+    monkeypatch.setattr(selection, "HELDOUT_SEEDS_FROM", 1)
     monkeypatch.setattr(stages.RobotBuilder, "yardstick_episodes", 1)
     built = builder(tmp_path)
     run_all(built)
@@ -360,30 +359,6 @@ def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
     more.scores()
     more.pack()
     assert set(pq.read_table(tmp_path / "data" / "scores.parquet")["ghn_seed"].to_pylist()) == {0, 1, 2}
-
-
-def scores_of(means):
-    rows = [
-        {"architecture": "x", "ghn_seed": seed, "seed": episode, "return": returns, "success_once": True}
-        | {"success_at_end": episode < round(success * 10)}
-        for seed, (success, returns) in enumerate(means)
-        for episode in range(10)
-    ]
-    return pa.Table.from_pylist(rows)
-
-
-def test_selection_keeps_the_best_that_reach_both_thresholds():
-    task = tasks.get("PickCube-v1")
-    scores = scores_of([(0.9, 36.0), (1.0, 34.0), (0.8, 40.0), (1.0, 35.0)])
-    rows = list(stages.select(task, "seen", "x", scores))
-    assert [row["kept"] for row in rows] == [row["passed"] for row in rows] == [True, False, False, True]
-    assert [row["success_at_end"] for row in rows] == [0.9, 1.0, 0.8, 1.0]
-    assert all(row["kept"] for row in stages.select(task, "unseen", "x", scores))
-
-    many = scores_of([(0.9 + 0.1 * (seed % 2), 36.0) for seed in range(120)])
-    kept = [row["ghn_seed"] for row in stages.select(task, "seen", "x", many) if row["kept"]]
-    assert all(row["passed"] for row in stages.select(task, "seen", "x", many))
-    assert len(kept) == 100 and set(range(1, 120, 2)) <= set(kept)
 
 
 def test_weight_noise_is_relative_to_each_block():

@@ -57,7 +57,7 @@ def make_data_folder(folder: Path, task: str = "PickCube-v1", inputs: int = 42, 
         for architecture, split in ARCHITECTURES.items()
     ]
     pq.write_table(pa.Table.from_pylist(rows), folder / "selection.parquet")
-    write_manifest(folder)
+    write_manifest(folder, None)
     return folder
 
 

@@ -58,7 +58,7 @@ def test_other_machines_and_thread_counts_give_the_same_bytes(
     plain = {"ATEN_CPU_CAPABILITY": "default", "MKL_CBWR": "COMPATIBLE"}
     in_another_process(data_folder, tmp_path / "other", 2, **plain)
     assert hashes(tmp_path / "other") == hashes(zoo_folder)
-    write_manifest(shutil.copytree(data_folder, tmp_path / "again"))
+    write_manifest(shutil.copytree(data_folder, tmp_path / "again"), None)
     assert hashes(tmp_path / "again") == hashes(data_folder)
 
 
@@ -195,7 +195,7 @@ def test_policies_that_are_not_finite_are_refused(
     data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with planted(monkeypatch, (1e6,)), pytest.raises(UserError, match=r"PickCube-v1/32-16-64-32/000 .*not finite"):
-        write_manifest(shutil.copytree(data_folder, tmp_path / "bad"))
+        write_manifest(shutil.copytree(data_folder, tmp_path / "bad"), None)
 
 
 def test_machines_that_round_a_tie_to_different_sides_make_the_same_bytes(
@@ -204,7 +204,7 @@ def test_machines_that_round_a_tie_to_different_sides_make_the_same_bytes(
     tie, last_bit = 1 + 2**-11, 2**-52  # halfway between two float16 numbers, and the float64 next to it
     ours = shutil.copytree(data_folder, tmp_path / "ours")
     with planted(monkeypatch, (tie + last_bit, -tie, 0.25)):
-        write_manifest(ours)
+        write_manifest(ours, None)
         materialise(ours, tmp_path / "here")
     with planted(monkeypatch, (tie - last_bit, -tie - last_bit, 0.25)):
         materialise(ours, tmp_path / "there")
