@@ -1,4 +1,4 @@
-"""How far apart the policies of an architecture lie, and how alike their weights are laid out (NNiT 5.1, appendices).
+"""How far apart the policies of an architecture lie, and how alike their weights are laid out (NNiT 6.1, appendices).
 
 All measures are exact, in float64, and keep at most a few copies of the batch in memory.
 """

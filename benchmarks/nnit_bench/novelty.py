@@ -121,7 +121,8 @@ def _behaviour(task: Task, states: Tensor, batch: PolicyBatch) -> Tensor:
 class _Canvas:
     """Networks of one depth as vectors: blocks in the corner of the largest, weights times the root of their fan-in.
 
-    A hypernetwork divides by that root, so a part of a network carried over to another width is the same vector.
+    A hypernetwork divides by that root, so a part of a network carried over to another width is the same vector. Inputs
+    that no neuron reads do not count, so that one padded with silent neurons is the same vector, too.
     """
 
     shapes: tuple[tuple[int, int], ...]
@@ -132,7 +133,9 @@ class _Canvas:
         for layer, (rows, columns) in zip(batch.layers, self.shapes, strict=True):
             canvas = np.zeros((len(batch), rows, columns))
             out, into = min(rows, layer.shape[1]), min(columns, layer.shape[2]) - 1
-            canvas[:, :out, :into] = layer[:, :out, :into].double().numpy() * (layer.shape[2] - 1) ** 0.5
+            weights = layer[:, :, :-1].double().numpy()
+            fan_in = weights.any(axis=1).sum(axis=1)[:, None, None]
+            canvas[:, :out, :into] = weights[:, :out, :into] * fan_in**0.5
             canvas[:, :out, -1] = layer[:, :out, -1].double().numpy()
             parts.append(canvas.reshape(len(batch), -1))
         return np.concatenate(parts, axis=1)

@@ -44,7 +44,7 @@ EXTENSIONS: dict[str, tuple[str, ...]] = {
 """Architectures beyond the zoo's grid (not in the paper): other widths, larger widths, other depths."""
 
 POLICIES: dict[str, int] = {"unseen": 80, "seen": 100, "excluded": 90, "joint": 100}
-"""Policies generated in all, spread evenly over the split's architectures (NNiT tables 2, 3 and 6, appendix J)."""
+"""Policies generated in all, spread evenly over the split's architectures (NNiT tables 2, 3 and 9, appendix I)."""
 DEFAULT_POLICIES = 80
 """The same for the other splits, which are not in the paper and follow `unseen`."""
 
@@ -98,11 +98,11 @@ class Protocol(_Frozen):
     selection: Selection = "heldout"
     """Episodes that score the selected: `paper`, those that selected them; `heldout`, others as well."""
     top: int = 10
-    """How many of the generated policies are selected (NNiT 5.2: 10)."""
+    """How many of the generated policies are selected (NNiT 6.3: 10)."""
     seed: int = 0
     """Seed of the generator's sampling, and its fitting if it has no checkpoint; episodes do not depend on it."""
     select: Episodes
-    """The episodes that every policy plays (NNiT 5.2: 50)."""
+    """The episodes that every policy plays (NNiT 6.3: 50)."""
     report: Episodes | None
     """The episodes that the selected play again; null under `paper`, and for a task whose episodes are a test set. Such
     a set is halved instead: selected on its even seeds, scored on the odd ones."""

@@ -38,9 +38,10 @@ def show(results: Results) -> None:
     console.print(f"Below each number its 95 % interval. {_selection(protocol)}")
     if results.zoo:
         which = "seen" if protocol.is_joint else "these"
+        selected = ", which selected them" if protocol.is_joint or protocol.split == "seen" else ""
         console.print(
             f"* the {results.zoo.policies} stored policies of {which} architectures, as scored when the zoo was built, "
-            f"{results.zoo.episodes} episodes each"
+            f"{results.zoo.episodes} episodes each{selected}"
         )
     for outcome in outcomes:
         _remarks(console, outcome)

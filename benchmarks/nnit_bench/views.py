@@ -25,7 +25,7 @@ from nnit_bench.protocol import Metric, Protocol
 from nnit_bench.statistics import Estimate, Floats, Ints, mean
 from nnit_zoo.architecture import hidden_widths, split_of
 
-FUNCTIONAL = 0.5  # headline score from which a policy counts as functional (NNiT appendix J does not say)
+FUNCTIONAL = 0.5  # headline score from which a policy counts as functional (NNiT appendix I does not say)
 
 
 class Scores(NamedTuple):
@@ -51,7 +51,7 @@ class Scores(NamedTuple):
 
 @dataclass(frozen=True)
 class Architectures:
-    """What a generator that chooses its architectures chose (NNiT appendix J)."""
+    """What a generator that chooses its architectures chose (NNiT appendix I)."""
 
     distinct: int
     """How many different ones."""

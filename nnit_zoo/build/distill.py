@@ -1,6 +1,6 @@
 """From expert to GHNs: DAgger gathers a buffer of states once; every seed's GHN starts from it and adds its own.
 
-NNiT appendix C distils each GHN with DAgger of its own. A shared buffer costs far less on a CPU (docs/deviations.md);
+NNiT appendix D distils each GHN with DAgger of its own. A shared buffer costs far less on a CPU (docs/deviations.md);
 a few on-policy rounds then show each GHN the states that its own policies reach. The record says which came from where.
 """
 

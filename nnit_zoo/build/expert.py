@@ -1,4 +1,4 @@
-"""The expert: PPO on a CPU, 3 x 256 Tanh, whose mean action the GHNs are distilled from (NNiT appendix C)."""
+"""The expert: PPO on a CPU, 3 x 256 Tanh, whose mean action the GHNs are distilled from (NNiT appendix D)."""
 
 from __future__ import annotations
 

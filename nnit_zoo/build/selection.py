@@ -35,7 +35,7 @@ def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Itera
     """The selection rows of one architecture's candidates, by GHN seed.
 
     Of a seen architecture, the best 100 that reach all thresholds are kept; the best by the first threshold's metric,
-    then the next (NNiT appendix C). Of a reference architecture, and of held-out seeds, all are kept: they are a
+    then the next (NNiT appendix D). Of a reference architecture, and of held-out seeds, all are kept: they are a
     yardstick, which a filter would bend.
     """
     columns = ("success_once", "success_at_end", "return")

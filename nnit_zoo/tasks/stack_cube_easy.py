@@ -1,6 +1,6 @@
 """StackCubeEasy-v1: put a cube on one that cannot move, and let go (the paper's variant of ManiSkill's StackCube-v1).
 
-NNiT appendix C: the lower cube is kinematic, the tolerance 0.02 m, the observations PickCube-v1's. What it leaves open
+NNiT appendix D: the lower cube is kinematic, the tolerance 0.02 m, the observations PickCube-v1's. What it leaves open
 is in docs/deviations.md. `nnit_zoo.envs` has the same task as a ManiSkill environment.
 """
 

@@ -94,11 +94,11 @@ class Task(ABC):
     episode_seeds: ClassVar[range] = range(2**32)
     """The seeds of all episodes that there are; the default is what numpy's RandomState accepts."""
     scoring_seeds: ClassVar[range] = range(10_000_000, 10_000_064)
-    """The episodes that candidates for the zoo are scored on (NNiT appendix C: 64)."""
+    """The episodes that candidates for the zoo are scored on (NNiT appendix D: 64)."""
     simulator: Simulator | None = None
     """What plays the episodes of a task that is simulated."""
     episodes: ClassVar[int] = 50
-    """Episodes per policy and phase of a benchmark run, unless it asks for another number (NNiT 5.2: 50)."""
+    """Episodes per policy and phase of a benchmark run, unless it asks for another number (NNiT 6.3: 50)."""
 
     def phase_seeds(self, phase: Phase, episodes: int) -> range:
         """The episodes of a benchmark run: all policies play `select`, then the best play `report`.

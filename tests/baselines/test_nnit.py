@@ -311,7 +311,7 @@ def test_an_unknown_preset_gets_an_answer():
 
 
 def test_the_preset_paper_holds_the_paper_s_hyperparameters():
-    """NNiT, table 7, PickCube."""
+    """NNiT, table 8, PickCube."""
     paper = NNiT.from_preset("paper").settings
     assert (paper.objective, paper.chain, paper.precision, paper.decay) == ("noise", 1000, "bfloat16", "cosine")
     assert (paper.learning_rate, paper.last_learning_rate, paper.warmup) == (7e-5, 3e-5, 500)

@@ -57,6 +57,13 @@ def test_a_crop_of_a_training_policy_is_a_copy_of_it(task: Any, zoo: Zoo) -> Non
     assert max(rows["any_architecture"].to_pylist()) < 1e-6
 
 
+def test_a_training_policy_padded_with_silent_neurons_is_a_copy_of_it(task: Any, zoo: Zoo) -> None:
+    padded = resize(zoo.batch("32-16-64-32", "seen").to(torch.float32), parse("32-32-64-64"))
+    found, rows = novelty.measure(task, zoo, [padded])
+    assert found.copies == 2
+    assert rows["any_architecture_name"].to_pylist() == ["32-16-64-32"] * 2
+
+
 def test_permuted_neurons_still_act_the_same(task: Any, zoo: Zoo) -> None:
     """A copy with its neurons in another order is far in weights and at zero in actions."""
     stored = zoo.batch(SEEN, "seen").to(torch.float32)

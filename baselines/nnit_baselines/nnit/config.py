@@ -81,7 +81,7 @@ class NNiTConfig(BaseModel):
 
 PRESETS = {
     "cpu": NNiTConfig(),
-    # NNiT 5 and table 7. Silent, and ours: patch, width, depth, heads (DiT-S), beta2, sampling steps (DiT). The paper
+    # NNiT 5 and table 8. Silent, and ours: patch, width, depth, heads (DiT-S), beta2, sampling steps (DiT). The paper
     # counts epochs: 1300 of 6400 / 16 steps; on PushCube-v1 1000, which is --steps 400000.
     "paper": NNiTConfig(
         padded=True,
