@@ -15,7 +15,7 @@ import time
 import torch
 
 from nnit_baselines.controls.initial import Random
-from nnit_baselines.generator import Run, SampleRequest
+from nnit_baselines.generator import FitOptions, SampleRequest
 from nnit_baselines.nnit.config import NNiTConfig, preset
 from nnit_baselines.nnit.generator import NNiT
 from nnit_baselines.nnit.mixture import Packed
@@ -39,7 +39,7 @@ class Stopwatch:
 
     def __init__(self, settings: NNiTConfig, view: TrainingView) -> None:
         self.generator = NNiT(settings)
-        self.generator.fit(view, Run(steps=1))
+        self.generator.fit(view, FitOptions(steps=1))
         data = [Packed.of(view.batch(each), self.generator.form, settings) for each in view.architectures]
         self.trainer = Trainer(self.generator.model, data, self.generator.mixture, seed=0)
         self.trainer.advance()  # the first step allocates

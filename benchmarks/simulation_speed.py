@@ -20,11 +20,11 @@ from joblib import Parallel, delayed, parallel_config
 
 from nnit_zoo import tasks
 from nnit_zoo.build import expert
+from nnit_zoo.places import data_folder
 from nnit_zoo.sim import headless, tabletop
 from nnit_zoo.sim.rollout import rollout
 from nnit_zoo.sim.tabletop import Array
 from nnit_zoo.tasks.robot import SCENES, RobotPolicyTask
-from nnit_zoo.tasks.task import data_folder
 
 Act = Callable[[Array], Array]
 

@@ -1,21 +1,31 @@
 """A zoo of small policies: what a policy is, how a zoo is stored, fetched, checked and built.
 
 >>> import nnit_zoo
->>> zoo = nnit_zoo.load("PickCube-v1")  # after `nnit-zoo download --task PickCube-v1`
+>>> zoo = nnit_zoo.load("PickCube-v1", download=True)
 >>> zoo.batch("32-16-64-32", split="seen")
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nnit_zoo.zoo import Zoo
+    from nnit_zoo.architecture import Architecture
+    from nnit_zoo.errors import UserError
+    from nnit_zoo.policy import PolicyBatch
+    from nnit_zoo.zoo import TrainingView, Zoo, load
 
+__all__ = ["Architecture", "PolicyBatch", "TrainingView", "UserError", "Zoo", "load"]
+_MODULES = {"Architecture": "architecture", "PolicyBatch": "policy", "UserError": "errors"}
 
-def load(task: str, folder: Path | str | None = None) -> Zoo:
-    """The task's zoo in `folder`, by default where `nnit-zoo download` puts it; see `nnit_zoo.zoo.load`."""
-    from nnit_zoo import zoo  # not at the top: `import nnit_zoo` stays free of torch
+if not TYPE_CHECKING:  # mypy would take every name for one of this package
 
-    return zoo.load(task, folder)
+    def __getattr__(name: str) -> Any:
+        """The class or function of this name; not imported at the top, so that `import nnit_zoo` is free of torch."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_MODULES.get(name, 'zoo')}"), name)
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

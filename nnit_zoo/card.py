@@ -20,6 +20,8 @@ from huggingface_hub import DatasetCardData
 
 from nnit_zoo import files, tasks
 from nnit_zoo.atomic import write_atomically, write_bytes, write_json
+from nnit_zoo.places import data_folder
+from nnit_zoo.summary import by_split
 from nnit_zoo.zoo import Zoo, damaged
 
 DESCRIPTION = (
@@ -111,7 +113,7 @@ def readme(indexes: Sequence[tuple[files.Manifest, pa.Table]], repository: str =
     configs: list[dict[str, Any]] = [
         {
             "config_name": manifest.task,
-            "data_files": [{"split": split, "path": _path(manifest.task, split)} for split in files.summary(index)],
+            "data_files": [{"split": split, "path": _path(manifest.task, split)} for split in by_split(index)],
         }
         for manifest, index in indexes
     ]
@@ -121,7 +123,7 @@ def readme(indexes: Sequence[tuple[files.Manifest, pa.Table]], repository: str =
     )
     lines = ["| Task | Split | Architectures | Policies | Success at end | Return |", "|---|---|---|---|---|---|"]
     for manifest, index in indexes:
-        for split, row in files.summary(index).items():
+        for split, row in by_split(index).items():
             success = "" if row["success_at_end"] is None else f"{row['success_at_end']:.1%}"
             numbers = f"{row['architectures']} | {row['policies']:,} | {success} | {row['return']:.3g}"
             lines.append(f"| {manifest.task} | {split} | {numbers} |")
@@ -141,7 +143,7 @@ def readme(indexes: Sequence[tuple[files.Manifest, pa.Table]], repository: str =
 def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> None:
     """Write the zoos to `folder` as a data set: per task its files, task.json and policies/<split>.parquet.
 
-    A zoo that is the one embedded here also gets what it was made from, and all candidates' scores, in build/. Raises
+    The zoo that ships also gets what it was made from, and all candidates' scores, in build/. Raises
     UserError if a zoo lacks a shard.
     """
     for zoo in zoos:
@@ -151,12 +153,12 @@ def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> 
         for name in (*zoo.manifest.files, files.MANIFEST):
             write_atomically(place / name, partial(shutil.copyfile, zoo.folder / name))
         write_json(place / "task.json", tasks.get(zoo.task).record)
-        embedded = files.EMBEDDED / zoo.task
-        if (embedded / files.MANIFEST).is_file() and files.Manifest.read(embedded) == zoo.manifest:
+        data = data_folder(zoo.task)
+        if (data / files.MANIFEST).is_file() and files.Manifest.read(data) == zoo.manifest:
             for name in (files.EXPERT, files.GHNS, files.SELECTION, files.CANDIDATE_EPISODES):
-                if (embedded / name).is_file():  # MNIST-PCA32 has no expert
-                    write_atomically(place / "build" / name, partial(shutil.copyfile, embedded / name))
-        for split in files.summary(zoo.index):
+                if (data / name).is_file():  # MNIST-PCA32 has no expert
+                    write_atomically(place / "build" / name, partial(shutil.copyfile, data / name))
+        for split in by_split(zoo.index):
             write_atomically(folder / _path(zoo.task, split), partial(_write_policies, zoo, split))
     indexes = [(zoo.manifest, zoo.index) for zoo in zoos]
     write_bytes(folder / "README.md", readme(indexes, repository).encode())
@@ -181,7 +183,7 @@ def _write_policies(zoo: Zoo, split: str, path: Path) -> None:
 
 def croissant(folder: Path, zoos: Sequence[Zoo]) -> dict[str, Any]:
     """The Croissant 1.0 description of the data set in `folder`: a record set per task and split."""
-    parts = [(zoo.task, split) for zoo in zoos for split in files.summary(zoo.index)]
+    parts = [(zoo.task, split) for zoo in zoos for split in by_split(zoo.index)]
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",

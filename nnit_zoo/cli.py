@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, CycloptsError, Parameter
 from cyclopts.validators import Number
 
-from nnit_zoo.console import print_json, print_rows, print_table
+from nnit_zoo.console import SEVERAL, Json, Names, print_json, print_rows, print_table
 from nnit_zoo.errors import UserError
 
 app = App(
@@ -22,20 +22,21 @@ app = App(
 app.register_install_completion_command(help="Set up completion in your shell.")
 app.command("nnit_zoo.build.stages:build", name="build", help="Build a task's zoo: expert, GHNs, selection, manifest.")
 
-Json = Annotated[bool, Parameter(name="--json")]
-Split = Literal["seen", "unseen", "excluded", "heldout_seed"]
+Splits = Annotated[tuple[Literal["seen", "unseen", "excluded", "heldout_seed"], ...], SEVERAL]
 
 
 @app.command(name="list")
 def list_zoos(*, as_json: Json = False) -> None:
-    """List the zoos that this version of nnit embeds.
+    """List the zoos that ship with this version of nnit.
 
     Args:
         as_json: Print JSON.
     """
-    from nnit_zoo import files
+    from rich.filesize import decimal
 
-    zoos = [files.describe(task) for task in files.tasks_with_zoo()]
+    from nnit_zoo import places, summary
+
+    zoos = [summary.describe(task) for task in places.tasks_with_zoo()]
     if as_json:
         print_json(zoos)
         return
@@ -44,7 +45,7 @@ def list_zoos(*, as_json: Json = False) -> None:
             zoo["task"],
             f"{zoo['splits'].get('seen', {}).get('policies', 0):,}",
             f"{zoo['policies']:,}",
-            files.readable(zoo["bytes"]),
+            decimal(zoo["bytes"]),
             _downloaded(zoo),
         )
         for zoo in zoos
@@ -61,11 +62,11 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
         architecture: Hidden widths such as 32-16-64-32.
         as_json: Print JSON.
     """
-    from nnit_zoo import files
+    from nnit_zoo import files, places, summary
     from nnit_zoo.architecture import check_known
 
     if architecture is None:
-        zoo = files.describe(task) | {"layout": _layout(task)}
+        zoo = summary.describe(task) | {"layout": _layout(task)}
         if as_json:
             print_json(zoo)
             return
@@ -80,7 +81,8 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
             print_table(("input", "entries"), list(zoo["layout"].items()))
         return
     check_known([architecture])
-    policies = files.read_index(files.embedded(task) / files.INDEX, architecture).to_pylist()
+    _, index = places.shipped(task)
+    policies = [row for row in index.to_pylist() if row["architecture"] == architecture]
     if as_json:
         print_json(policies)
         return
@@ -91,26 +93,28 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
 def download(
     task: str = "PickCube-v1",
     *,
-    split: list[Split] | None = None,
+    split: Splits = (),
     source: Annotated[str | None, Parameter(env_var="NNIT_ZOO_SOURCE")] = None,
     revision: str | None = None,
     folder: Path | None = None,
     dry_run: bool = False,
     as_json: Json = False,
 ) -> None:
-    """Bring a zoo to this machine: from a source, or made from the GHNs that nnit embeds, with the same bytes.
+    """Bring a zoo to this machine: from a source, or made from the GHNs that ship with nnit, with the same bytes.
 
     What is there already is kept; after an interruption, run it again.
 
     Args:
         task: Name of the task.
-        split: Only the shards with policies of this split; may be given several times.
+        split: Only the shards with policies of these splits; repeat the option or use commas.
         source: A data set of the Hub (owner/name or hf://datasets/owner/name), or a folder.
         revision: Branch, tag or commit of the data set.
         folder: Where to write, instead of the cache of huggingface_hub.
         dry_run: Only say what would be written.
         as_json: Print JSON.
     """
+    from rich.filesize import decimal
+
     from nnit_zoo import files
     from nnit_zoo.display import Display
     from nnit_zoo.download import Download
@@ -119,13 +123,13 @@ def download(
     target, splits = zoo.folder, split or files.SPLITS
     if dry_run:
         count, missing = len(zoo.wanted(splits)), zoo.missing(splits)
-        size, free = sum(entry.size for entry in missing.values()), files.free_bytes(target)
+        size, free = sum(entry.size for entry in missing.values()), zoo.free_bytes
         if as_json:
             counts = {"files": count, "missing": len(missing), "missing_bytes": size, "free_bytes": free}
             print_json({"task": task, "folder": str(target), **counts})
         else:
-            sys.stdout.write(f"{target}: {len(missing)} of {count} files to write, {files.readable(size)}; ")
-            sys.stdout.write(f"{files.readable(free)} free\n")
+            sys.stdout.write(f"{target}: {len(missing)} of {count} files to write, {decimal(size)}; ")
+            sys.stdout.write(f"{decimal(free)} free\n")
         return
     zoo.run(Display(quiet=False), splits)
     if as_json:
@@ -138,7 +142,7 @@ def download(
 def verify(
     task: str = "PickCube-v1",
     *,
-    split: list[Split] | None = None,
+    split: Splits = (),
     deep: Annotated[int, Parameter(validator=Number(gte=0))] = 0,
     folder: Path | None = None,
     as_json: Json = False,
@@ -147,7 +151,7 @@ def verify(
 
     Args:
         task: Name of the task.
-        split: Only the shards with policies of this split; may be given several times.
+        split: Only the shards with policies of these splits; repeat the option or use commas.
         deep: Also score this many policies anew, on the episodes of the build, and compare with the index.
         folder: Where the zoo is, if not in the cache of huggingface_hub.
         as_json: Print JSON.
@@ -183,7 +187,7 @@ def verify(
 def stats(
     task: str = "PickCube-v1",
     *,
-    architecture: list[str] | None = None,
+    architecture: Annotated[Names, Parameter(show_default=False)] = (),
     output: Path | None = None,
     folder: Path | None = None,
     as_json: Json = False,
@@ -192,7 +196,7 @@ def stats(
 
     Args:
         task: Name of the task.
-        architecture: Hidden widths to look at, three by default; may be given several times.
+        architecture: Hidden widths to look at, three by default; repeat the option or use commas.
         output: Folder for the figures; without it none are drawn.
         folder: Where the zoo is, if not in the cache of huggingface_hub.
         as_json: Print JSON.
@@ -253,44 +257,43 @@ def export(policy: str, output: Path, *, folder: Path | None = None, as_json: Js
 
 
 @app.command
-def card(*, task: list[str] | None = None, as_json: Json = False) -> None:
+def card(*, task: Names = (), as_json: Json = False) -> None:
     """Print the README card of the data set that `export` and `push` write.
 
     Args:
-        task: Only this task; may be given several times.
+        task: Only these tasks; repeat the option or use commas.
         as_json: Print what the card says of each zoo as JSON.
     """
-    from nnit_zoo import files
+    from nnit_zoo import places, summary
 
-    chosen = task or list(files.tasks_with_zoo())
+    chosen = task or places.tasks_with_zoo()
     if as_json:
-        print_json([files.describe(name) for name in chosen])
+        print_json([summary.describe(name) for name in chosen])
         return
     from nnit_zoo.card import readme
 
-    places = [files.embedded(name) for name in chosen]
-    sys.stdout.write(readme([(files.Manifest.read(place), files.read_index(place / files.INDEX)) for place in places]))
+    sys.stdout.write(readme([places.shipped(name) for name in chosen]))
 
 
 @app.command
-def push(repository: str, *, task: list[str] | None = None, folder: Path | None = None, as_json: Json = False) -> None:
+def push(repository: str, *, task: Names = (), folder: Path | None = None, as_json: Json = False) -> None:
     """Upload downloaded zoos, as one data set, to the Hub; log in first with `hf auth login`.
 
     The data set is made, and public, unless it is there already.
 
     Args:
         repository: owner/name of the data set.
-        task: Only this task; may be given several times.
+        task: Only these tasks; repeat the option or use commas.
         folder: Where the zoo is, if not in the cache of huggingface_hub.
         as_json: Print JSON.
     """
     from tempfile import TemporaryDirectory
 
-    from nnit_zoo import files, hub
+    from nnit_zoo import hub, places
     from nnit_zoo.card import write_dataset
     from nnit_zoo.zoo import load
 
-    zoos = [load(name, folder) for name in task or files.tasks_with_zoo()]
+    zoos = [load(name, folder) for name in task or places.tasks_with_zoo()]
     with TemporaryDirectory() as place:
         write_dataset(Path(place), zoos, repository)
         commit = hub.push(repository, Path(place))

@@ -1,11 +1,28 @@
-"""What `nnit-zoo` prints on stdout: tables or JSON; rich is imported when it is needed."""
+"""What the command lines share: kinds of options, and tables and JSON on stdout; rich is imported when needed."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import Parameter, Token, convert
+
+from nnit_zoo.errors import UserError
+
+
+def split_at_commas(kind: Any, tokens: Sequence[Token]) -> Any:
+    """The value of an option that may be repeated and may hold commas, as a converter of cyclopts."""
+    names = [token.evolve(value=name) for token in tokens for name in token.value.split(",") if name]
+    if not names:
+        raise UserError(f"{tokens[0].keyword} needs a name")
+    return convert(kind, names)
+
+
+Json = Annotated[bool, Parameter(name="--json")]
+SEVERAL = Parameter(converter=split_at_commas, show_default=lambda names: ", ".join(names) or "all")
+Names = Annotated[tuple[str, ...], SEVERAL]
 
 
 def print_json(content: Any) -> None:

@@ -1,7 +1,8 @@
-"""Bring a task's zoo to this machine: from a source, or made from the GHNs that nnit embeds, with the same bytes."""
+"""Bring a task's zoo to this machine: from a source, or made from the GHNs that ship with nnit, with the same bytes."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Collection
 from functools import partial
 from io import BytesIO
@@ -9,16 +10,16 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from nnit_zoo import files
+from nnit_zoo import files, places
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import INDEX, MANIFEST, SPLITS, Entry, Manifest, Progress
+from nnit_zoo.files import INDEX, MANIFEST, SPLITS, Entry, Progress
 
 
 class Download:
     """A zoo and the folder that it goes to, by default the task's usual one; nothing is written before `run`.
 
-    `source` is an address as of `nnit_zoo.hub.Source`; without one, the zoo is made from the embedded GHNs. Raises
+    `source` is an address as of `nnit_zoo.hub.Source`; without one, the zoo is made from the GHNs that ship. Raises
     UserError if there is no such zoo, or if a source's would take the place of this version's.
     """
 
@@ -26,25 +27,30 @@ class Download:
         self, task: str, folder: Path | None = None, *, source: str | None = None, revision: str | None = None
     ) -> None:
         self.task = task
-        self.folder = files.default_folder(task) if folder is None else folder
+        self.folder = places.default_folder(task) if folder is None else folder
         self._verb = "fetching" if source else "making"
         self._index: pa.Table
         self._bring: Callable[[Path, Progress, Collection[str]], None]
         if source is None:
             if revision:
                 raise UserError("--revision says which version of a --source: give both")
-            embedded = files.embedded(task)
-            self.manifest, self._index = Manifest.read(embedded), files.read_index(embedded / INDEX)
-            self._bring = partial(_make, embedded)
+            self.manifest, self._index = places.shipped(task)
+            self._bring = partial(_make, places.data_folder(task))
             return
         from nnit_zoo.hub import Source  # noqa: PLC0415  most zoos come from no source
 
         found = Source(source, task, revision)
-        if folder is None and found.manifest != Manifest.read(files.embedded(task)):
+        if folder is None and found.manifest != places.shipped(task)[0]:
             raise UserError(
                 f"{source} holds another version of the zoo than this nnit; keep it elsewhere with --folder"
             )
         self.manifest, self._index, self._bring = found.manifest, files.read_index(BytesIO(found.index)), found.fetch
+
+    @property
+    def free_bytes(self) -> int:
+        """Free space, in bytes, on the disk that holds the folder or would hold it."""
+        existing = next(path for path in (self.folder, *self.folder.resolve().parents) if path.exists())
+        return shutil.disk_usage(existing).free
 
     @property
     def is_there(self) -> bool:
@@ -67,7 +73,7 @@ class Download:
             self._bring(self.folder, progress, splits)
 
 
-def _make(embedded: Path, target: Path, progress: Progress, splits: Collection[str]) -> None:
+def _make(data_folder: Path, target: Path, progress: Progress, splits: Collection[str]) -> None:
     from nnit_zoo.materialise import materialise  # noqa: PLC0415  imports torch, which a dry run does not need
 
-    materialise(embedded, target, progress, splits)
+    materialise(data_folder, target, progress, splits)

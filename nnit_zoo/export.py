@@ -42,7 +42,7 @@ def export(zoo: Zoo, name: str, output: Path) -> None:
         policy = zoo[name]
         if output.suffix not in WRITERS:
             raise unknown_name("format", output.suffix, WRITERS)
-        content = WRITERS[output.suffix](policy.to_module(raw=True).eval(), policy.record)
+        content = WRITERS[output.suffix](policy.to_module().eval(), policy.record)
     write_bytes(output, content)
 
 

@@ -1,7 +1,7 @@
-"""Where a zoo's files lie, what they promise, and whether they hold it; imports no torch.
+"""The files of a zoo: what they are called, what they promise, and whether they hold it; imports no torch.
 
 A zoo folder holds `index.parquet` (a row per policy), one safetensors shard per architecture and `manifest.json` with
-the size and SHA-256 of each of them. The embedded folder of a task, in the package, holds the same index and manifest
+the size and SHA-256 of each of them. The data folder of a task, in the package, holds the same index and manifest
 beside the GHNs from which the shards are made, and `selection.parquet`, a row per candidate.
 """
 
@@ -10,27 +10,23 @@ from __future__ import annotations
 import errno
 import hashlib
 import io
-import shlex
-import shutil
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from huggingface_hub import cached_assets_path
 from pydantic import BaseModel, Field, ValidationError
+from rich.filesize import decimal
 
 from nnit_zoo import architecture as known
-from nnit_zoo import tasks
 from nnit_zoo.atomic import write_bytes
 from nnit_zoo.errors import UserError, unknown_name
 
 SPLITS = (*known.SPLITS, "heldout_seed")
 SCORES = ("success_at_end", "success_once", "return")
 Progress = Callable[[int], None]
-EMBEDDED = Path(__file__).parent / "data"
 INDEX = "index.parquet"
 MANIFEST = "manifest.json"
 EXPERT = "expert.safetensors"
@@ -57,6 +53,11 @@ INDEX_SCHEMA = pa.schema(
     ]
 )
 ADDED = ("n_params", "weight_norm")  # columns that the index of an older zoo may lack: they are null then
+
+
+def policy_split(split: str, ghn_seed: int) -> str:
+    """The split of the policy that a GHN makes for an architecture of `split`: `heldout_seed` for seeds from 128 on."""
+    return "heldout_seed" if ghn_seed >= HELDOUT_SEEDS_FROM else split
 
 
 class Entry(BaseModel):
@@ -161,7 +162,7 @@ def _write(path: Path, content: bytes, needed: int) -> None:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
-                f"no space left in {path.parent}: {needed} bytes ({readable(needed)}) are still to be written; "
+                f"no space left in {path.parent}: {needed} bytes ({decimal(needed)}) are still to be written; "
                 "make room and run the same command again, or choose another folder with --folder"
             ) from None
         raise UserError(
@@ -192,102 +193,3 @@ def read_index(path: Path | io.BytesIO, architecture: str | None = None) -> pa.T
             field = INDEX_SCHEMA.field(name)
             table = table.append_column(field, pa.nulls(len(table), field.type))
     return table if architecture is None else table.filter(pc.equal(table["architecture"], architecture))
-
-
-def summary(index: pa.Table) -> dict[str, dict[str, Any]]:
-    """Per split its numbers of architectures and policies and the mean scores of these, None where a task has none."""
-    counts = [("architecture", "count_distinct"), ("id", "count"), *((score, "mean") for score in SCORES)]
-    rows = index.group_by("split", use_threads=False).aggregate(counts).to_pylist()
-    return {
-        row["split"]: {
-            "architectures": row["architecture_count_distinct"],
-            "policies": row["id_count"],
-            **{score: row[f"{score}_mean"] for score in SCORES},
-        }
-        for row in sorted(rows, key=lambda row: SPLITS.index(row["split"]))
-    }
-
-
-def pass_rates(selection: Path) -> dict[str, float]:
-    """Per seen architecture, the share of its candidates for the corpus that reach the task's thresholds.
-
-    Empty for an older zoo, which does not say.
-    """
-    table = pq.ParquetFile(selection).read()
-    if "passed" not in table.column_names:
-        return {}
-    candidates = (pc.field("split") == "seen") & (pc.field("ghn_seed") < HELDOUT_SEEDS_FROM)
-    rows = table.filter(candidates).group_by("architecture", use_threads=False).aggregate([("passed", "mean")])
-    return dict(zip(rows["architecture"].to_pylist(), rows["passed_mean"].to_pylist(), strict=True))
-
-
-def ghns_of(selection: Path) -> int:
-    """The number of GHNs that made the candidates."""
-    return len(pc.unique(pq.ParquetFile(selection).read(["ghn_seed"])["ghn_seed"]))
-
-
-def tasks_with_zoo() -> tuple[str, ...]:
-    """The tasks whose zoo is embedded in this package."""
-    return tuple(sorted(path.parent.name for path in EMBEDDED.glob(f"*/{MANIFEST}")))
-
-
-def embedded(task: str) -> Path:
-    """The folder with the task's embedded zoo; raises UserError, with the command or near names, if there is none."""
-    if task not in tasks_with_zoo():
-        if task in tasks.names():
-            raise UserError(f"{task} has no zoo yet; build it with: nnit-zoo build --task {task}")
-        raise unknown_name("zoo", task, tasks_with_zoo())
-    return EMBEDDED / task
-
-
-def describe(task: str) -> dict[str, Any]:
-    """What there is to say of an embedded zoo: sizes, where it lies, how much of it is there, and its summary."""
-    manifest = Manifest.read(embedded(task))
-    index = read_index(embedded(task) / INDEX)
-    place = default_folder(task)
-    ours = (place / MANIFEST).is_file() and Manifest.read(place) == manifest
-    return {
-        "task": task,
-        "inputs": manifest.inputs,
-        "outputs": manifest.outputs,
-        "policies": index.num_rows,
-        "bytes": manifest.size,
-        "folder": str(place),
-        "shards": len(manifest.shards),
-        "shards_downloaded": sum((place / name).is_file() for name in manifest.shards) if ours else 0,
-        "splits": summary(index),
-        "pass_rates": pass_rates(embedded(task) / SELECTION),
-    }
-
-
-def default_folder(task: str) -> Path:
-    """Where `nnit-zoo download` puts the task's zoo: in the assets cache of huggingface_hub (HF_HOME moves it).
-
-    Raises UserError if that folder cannot be made.
-    """
-    try:
-        return cached_assets_path("nnit", "zoo", task)
-    except (OSError, ValueError) as error:
-        raise UserError(f"no cache folder for zoos ({error}); set HF_HOME to a folder that you can write") from None
-
-
-def download_command(task: str, folder: Path) -> str:
-    """The command that makes the zoo in `folder`, or mends it."""
-    where = "" if folder.resolve() == default_folder(task) else f" --folder {shlex.quote(str(folder))}"
-    return f"nnit-zoo download --task {task}{where}"
-
-
-def readable(size: int) -> str:
-    """A number of bytes for people: `17.2 MB`."""
-    value, unit = float(size), "B"
-    for larger in ("kB", "MB", "GB"):
-        if value < 1000:
-            break
-        value, unit = value / 1000, larger
-    return f"{value:.1f} {unit}" if unit != "B" else f"{size} B"
-
-
-def free_bytes(folder: Path) -> int:
-    """Free space, in bytes, on the disk that holds `folder` or would hold it."""
-    existing = next(path for path in (folder, *folder.resolve().parents) if path.exists())
-    return shutil.disk_usage(existing).free

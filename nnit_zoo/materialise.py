@@ -1,4 +1,4 @@
-"""Make a zoo's shards from its embedded GHNs: the same bytes on every machine, proved by the manifest.
+"""Make a zoo's shards from its GHNs, which ship: the same bytes on every machine, proved by the manifest.
 
 The GHNs decode in float64 and every parameter is rounded once to float16. Thread counts, processors and versions of
 BLAS sum in different orders, which moves a float64 parameter by about 1e-16. Its float16 bytes change only if that
@@ -23,14 +23,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from safetensors import SafetensorError, safe_open
 
-from nnit_zoo import files
+from nnit_zoo import files, ghn_file
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_bytes
-from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import GHNS, HELDOUT_SEEDS_FROM, SPLITS, Entry, Manifest, Progress
+from nnit_zoo.files import GHNS, SPLITS, Entry, Manifest, Progress, policy_split
+from nnit_zoo.ghn import GHN
 from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.zoo import policy_hashes
 
@@ -41,7 +40,7 @@ _MOST_TIES = 8  # of one policy that are tried on both sides
 def materialise(
     data_folder: Path, target: Path, progress: Progress | None = None, splits: Collection[str] = SPLITS
 ) -> None:
-    """Write the shards of these splits of the zoo that `data_folder` embeds to `target`, as `files.fill` does.
+    """Write the shards of these splits of the zoo in a task's data folder to `target`, as `files.fill` does.
 
     Shards that are there already are kept. Raises UserError if a shard comes out different from the manifest.
     """
@@ -65,7 +64,7 @@ def materialise(
         make,
         splits=splits,
         progress=progress,
-        advice=f"it came out different here (torch {torch.__version__}), so the embedded GHNs are damaged; install "
+        advice=f"it came out different here (torch {torch.__version__}), so the GHNs that ship are damaged; install "
         "nnit again, and if that does not help, please report it",
     )
 
@@ -113,19 +112,11 @@ class _Source:
     """The GHNs of a data folder and the rows of the policies to be kept, per architecture and by GHN seed."""
 
     def __init__(self, data_folder: Path) -> None:
-        try:
-            with safe_open(data_folder / GHNS, framework="pt") as file:
-                metadata = json.loads(file.metadata()["nnit"])
-                stacked = {name: file.get_tensor(name).double() for name in sorted(file.keys())}
-        except (SafetensorError, OSError) as error:
-            raise UserError(f"{data_folder / GHNS} is missing or damaged ({error}); install nnit again") from None
-        self.task: str = metadata["task"]
-        self.inputs: int = metadata["inputs"]
-        self.outputs: int = metadata["outputs"]
-        self._ghns = {}
-        for number, seed in enumerate(metadata["ghn_seeds"]):
-            state = {name: tensor[number] for name, tensor in stacked.items()}
-            self._ghns[seed] = GHN.from_state(self.inputs, self.outputs, state).double()
+        made_by = ghn_file.read(data_folder / GHNS)
+        self.task, self.inputs, self.outputs = made_by.task, made_by.inputs, made_by.outputs
+        self._ghns = {
+            seed: GHN.from_state(self.inputs, self.outputs, state).double() for seed, state in made_by.states.items()
+        }
         self.rows = self._kept_rows(data_folder / files.SELECTION)
 
     def _kept_rows(self, selection: Path) -> dict[Architecture, list[dict[str, Any]]]:
@@ -134,8 +125,7 @@ class _Source:
         kept.sort(key=lambda row: (SPLITS.index(row["split"]), row["architecture"], row["ghn_seed"]))
         grouped: dict[Architecture, list[dict[str, Any]]] = {}
         for row in kept:
-            if row["ghn_seed"] >= HELDOUT_SEEDS_FROM:
-                row["split"] = "heldout_seed"
+            row["split"] = policy_split(row["split"], row["ghn_seed"])
             architecture = Architecture.parse(row["architecture"], self.inputs, self.outputs)
             grouped.setdefault(architecture, []).append(row)
         return grouped

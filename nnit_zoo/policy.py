@@ -44,8 +44,18 @@ class PolicyBatch:
     def __iter__(self) -> Iterator[PolicyBatch]:
         return (self[index] for index in range(len(self)))
 
+    def __repr__(self) -> str:
+        sizes = f"{self.architecture.inputs} inputs, {self.architecture.outputs} outputs"
+        dtype = str(self.layers[0].dtype).removeprefix("torch.")
+        return f"<PolicyBatch: {len(self):,} networks {self.architecture}, {sizes}, {dtype}>"
+
     def __call__(self, observations: Tensor) -> Tensor:
-        """Outputs [n, b, outputs] of every network on standardised observations [n or 1, b, inputs]."""
+        """Outputs [n, b, outputs] of every network on standardised observations [n or 1, b, inputs].
+
+        Float16, which a zoo stores, is computed in float32.
+        """
+        if self.layers[0].dtype == torch.float16:
+            return self.to(torch.float32)(observations.float())
         hidden = observations
         for depth, layer in enumerate(self.layers):
             hidden = hidden @ layer[:, :, :-1].transpose(1, 2) + layer[:, None, :, -1]

@@ -13,11 +13,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from torch import Tensor
 
-from nnit_zoo import diversity, files, tasks
+from nnit_zoo import diversity, tasks
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import Progress
+from nnit_zoo.places import data_folder
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.views.permuted import permuted
 from nnit_zoo.zoo import TrainingView, Zoo
@@ -128,7 +129,7 @@ def population(batch: PolicyBatch, scores: pa.Table, observations: Tensor) -> di
 
 def twins(task: str) -> list[dict[str, Any]]:
     """Rows of a table: `measure`, its value for twins of each kind, and the paper's; empty if they were not built."""
-    path = files.EMBEDDED / task / TWINS
+    path = data_folder(task) / TWINS
     if not path.exists():
         return []
     found = json.loads(path.read_text())["populations"]

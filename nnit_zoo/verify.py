@@ -12,7 +12,7 @@ import torch
 from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture, split_of
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import HELDOUT_SEEDS_FROM, Progress
+from nnit_zoo.files import Progress, policy_split
 from nnit_zoo.zoo import Policy, Zoo, damaged, policy_hashes, read_shard
 
 DIFFERING = 3  # episodes of a policy that another processor may let end otherwise
@@ -98,11 +98,10 @@ def rescore(
 
 def _row_problems(row: dict[str, Any], task: str) -> list[str]:
     """A row of the index must follow from its architecture and GHN seed."""
-    heldout = row["ghn_seed"] >= HELDOUT_SEEDS_FROM
     expected = {
         "id": f"{task}/{row['architecture']}/{row['ghn_seed']:03d}",
         "task": task,
-        "split": "heldout_seed" if heldout else split_of(row["architecture"]),
+        "split": policy_split(split_of(row["architecture"]), row["ghn_seed"]),
         "shard": f"{row['architecture']}.safetensors",
     }
     return [

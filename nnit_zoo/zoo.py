@@ -14,11 +14,14 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import nn
 
-from nnit_zoo import files, tasks
+from nnit_zoo import files, places, tasks
 from nnit_zoo.architecture import Architecture, split_of
+from nnit_zoo.display import Display
+from nnit_zoo.download import Download
 from nnit_zoo.errors import UserError, unknown_name
 from nnit_zoo.files import HELDOUT_SEEDS_FROM, SPLITS
 from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.summary import by_split
 
 
 @dataclass(frozen=True)
@@ -28,12 +31,17 @@ class Policy:
     record: Mapping[str, Any]
     weights: PolicyBatch
 
-    def to_module(self, *, raw: bool = False) -> nn.Sequential:
+    def __repr__(self) -> str:
+        known = (f"{score} {self.record[score]:.3g}" for score in files.SCORES if self.record[score] is not None)
+        return f"<Policy {self.record['id']}: {', '.join((self.record['split'], *known))}>"
+
+    def to_module(self, *, standardised: bool = False) -> nn.Sequential:
         """The policy as a plain float32 nn.Sequential of Linear and Tanh.
 
-        It takes standardised observations; with `raw`, the task's standardisation is folded into its first layer.
+        It takes raw observations, as the task's environment gives them: the task's standardisation is folded into its
+        first layer. With `standardised`, it takes observations that are standardised already.
         """
-        if not raw:
+        if standardised:
             return self.weights.to_module(0)
         task = tasks.get(self.record["task"])
         mean, std = torch.from_numpy(task.observation_mean), torch.from_numpy(task.observation_std)
@@ -74,6 +82,10 @@ class Zoo:
     def task(self) -> str:
         """Name of the task that the policies solve."""
         return self.manifest.task
+
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{row['policies']:,} {split}" for split, row in by_split(self.index).items())
+        return f"<Zoo of {self.task} in {self.folder}: {len(self):,} policies ({splits})>"
 
     def __len__(self) -> int:
         return int(self.index.num_rows)
@@ -193,6 +205,10 @@ class TrainingView:
             if max(self.ghn_seeds(architecture), default=0) >= HELDOUT_SEEDS_FROM:
                 raise UserError(f"GHN seeds from {HELDOUT_SEEDS_FROM} on are held out: never for training")
 
+    def __repr__(self) -> str:
+        use = "for comparison only" if self.reference else "to learn from"
+        return f"<TrainingView of {self.task}: {len(self):,} policies of {len(self.batches)} architectures, {use}>"
+
     @property
     def architectures(self) -> tuple[Architecture, ...]:
         """The architectures that have policies here."""
@@ -219,26 +235,33 @@ class TrainingView:
         raise unknown_name("architecture in this view", str(architecture), map(str, self.batches))
 
 
-def load(task: str, folder: Path | str | None = None) -> Zoo:
+def load(task: str, folder: Path | str | None = None, *, download: bool = False) -> Zoo:
     """The task's zoo in `folder`, by default where `nnit-zoo download` puts it.
 
-    Raises UserError, naming the command that helps, if it is missing, damaged, another task's, or another version's.
+    With `download`, a zoo that is not there is made first, as that command does; in the default folder, one of another
+    version is replaced. Raises UserError, naming the command that helps, if the zoo is missing, damaged, another
+    task's, or another version's.
     """
-    return Zoo.open(locate(task, folder))
+    place = None if folder is None else Path(folder)
+    if download and (place is None or not (place / files.MANIFEST).is_file()):
+        wanted = Download(task, place)
+        if not wanted.is_there:
+            wanted.run(Display(quiet=False))
+    return Zoo.open(locate(task, place))
 
 
-def locate(task: str, folder: Path | str | None = None) -> Path:
+def locate(task: str, folder: Path | None = None) -> Path:
     """The folder of the task's zoo, if its manifest is the expected one; raises UserError as `load` does."""
-    place = files.default_folder(task) if folder is None else Path(folder)
-    release = files.Manifest.read(files.embedded(task)) if folder is None else None
+    place = places.default_folder(task) if folder is None else folder
+    release = places.shipped(task)[0] if folder is None else None
     if not (place / files.MANIFEST).is_file():
-        raise UserError(f"no zoo of {task} in {place} yet; run: {files.download_command(task, place)}")
+        raise UserError(f"no zoo of {task} in {place} yet; run: {places.download_command(task, place)}")
     manifest = files.Manifest.read(place)
     if manifest.task != task:
         raise UserError(f"{place} holds the zoo of {manifest.task}, not of {task}")
     if release is not None and manifest != release:
         raise UserError(
-            f"the zoo in {place} is from another version of nnit; run: {files.download_command(task, place)}"
+            f"the zoo in {place} is from another version of nnit; run: {places.download_command(task, place)}"
         )
     return place
 
@@ -263,4 +286,4 @@ def policy_hashes(batch: PolicyBatch) -> list[str]:
 
 def damaged(path: Path, task: str) -> UserError:
     """The error for a file of a zoo that is not what the manifest promises."""
-    return UserError(f"{path} is missing or damaged; mend it with: {files.download_command(task, path.parent)}")
+    return UserError(f"{path} is missing or damaged; mend it with: {places.download_command(task, path.parent)}")

@@ -19,21 +19,22 @@ import pytest
 
 import nnit_bench.cli
 import nnit_zoo.cli
-from nnit_baselines import generator
+from nnit_baselines import generator, registry
 from nnit_baselines.nnit import generator as nnit
 from nnit_baselines.nnit.config import NNiTConfig
 from nnit_bench import protocol, results
-from nnit_zoo import files, parallel
+from nnit_zoo import parallel, places, tasks
 from nnit_zoo.architecture import Architecture, hidden_widths
-from nnit_zoo.build import expert, mnist, stages
+from nnit_zoo.build import builder, expert, mnist, robot
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.mnist import MNISTConfig
+from nnit_zoo.places import data_folder
 from nnit_zoo.sim import render
 from nnit_zoo.stats import ARCHITECTURES
-from nnit_zoo.tasks.mnist import MNISTPCA32
+from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
-from nnit_zoo.tasks.task import data_folder
+from stand_in_hub import Hub, serving
 
 ROOT = Path(__file__).parents[1]
 PAGES = {
@@ -73,19 +74,19 @@ def toy_size(patch: pytest.MonkeyPatch, ghns: int) -> None:
     for kind in (PickCube, MNISTPCA32):
         patch.setattr(kind, "thresholds", dict.fromkeys(kind.thresholds, 0.0))  # nobody learns much
     patch.setattr(protocol, "policies_per_architecture", partial(few_policies, protocol.policies_per_architecture))
-    patch.setattr(generator, "Run", partial(few_training_steps, generator.Run))
+    patch.setattr(generator, "FitOptions", partial(few_training_steps, generator.FitOptions))
     patch.setattr(nnit, "NNiTConfig", ToyNNiT)
 
     patch.setattr(expert, "EVALUATION_SEEDS", range(2))
-    patch.setattr(stages, "architectures", few_architectures)
+    patch.setattr(builder, "architectures", few_architectures)
     few_steps = {"total_steps": 200, "environments": 2, "hidden": 16, "epochs": 1, "minibatch": 50}
-    patch.setattr(stages, "ExpertConfig", partial(ExpertConfig, **few_steps, evaluate_every=1))
+    patch.setattr(robot, "ExpertConfig", partial(ExpertConfig, **few_steps, evaluate_every=1))
     few_steps = {"rounds": 1, "episodes_per_round": 2, "round_steps": 2, "own_episodes": 2, "steps": 3}
-    patch.setattr(stages, "DistillConfig", partial(DistillConfig, **few_steps, architectures_per_step=2))
+    patch.setattr(robot, "DistillConfig", partial(DistillConfig, **few_steps, architectures_per_step=2))
     patch.setattr(mnist, "MNISTConfig", partial(MNISTConfig, steps=3, states_per_architecture=8))
-    start = stages.Builder.__init__
+    start = builder.Builder.__init__
     patch.setattr(
-        stages.Builder,
+        builder.Builder,
         "__init__",
         lambda self, task, work, seeds, *rest: start(self, task, work, min(seeds, ghns), *rest),
     )
@@ -111,13 +112,6 @@ def few_architectures(split, inputs, outputs):
     return tuple(Architecture.parse(text, inputs, outputs) for text in FEW[split])
 
 
-def build_into(folder: Path, patch: pytest.MonkeyPatch) -> None:
-    """Let `nnit-zoo build` write there and not into the package; the digits' features are given."""
-    patch.setattr(stages, "data_folder", lambda task: folder / task)
-    (folder / "MNIST-PCA32").mkdir(parents=True)
-    shutil.copy(data_folder("MNIST-PCA32") / "task.json", folder / "MNIST-PCA32")
-
-
 def call(command: str, patch: pytest.MonkeyPatch) -> int:
     """Run a command line of ours in this process; gives its exit code."""
     program, *arguments = shlex.split(command, comments=True)
@@ -136,24 +130,30 @@ def shipped(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         toy_size(patch, ghns=6)  # a page has GHN seed 5
-        build_into(place / "zoos", patch)
-        patch.setattr(files, "EMBEDDED", place / "zoos")
-        patch.setattr(files, "cached_assets_path", (place / "cache").joinpath)
+        digits = place / "zoos" / "MNIST-PCA32"
+        digits.mkdir(parents=True)
+        for name in ("task.json", FEATURES):  # without the original digits, these are given
+            shutil.copy(data_folder("MNIST-PCA32") / name, digits)
+        patch.setattr(places, "DATA", place / "zoos")
+        tasks.get.cache_clear()  # a task keeps the record that it has read
+        patch.setattr(places, "cached_assets_path", (place / "cache").joinpath)
         for task in TASKS:
             assert call(f"nnit-zoo build --task {task}", patch) == 0
             assert call(f"nnit-bench train --task {task} --output checkpoints/nnit/{task} --quiet", patch) == 0
-        zoo = files.default_folder("PickCube-v1")
-    return SimpleNamespace(zoos=place / "zoos", checkpoints=place / "checkpoints", zoo=zoo)
+        zoo = places.default_folder("PickCube-v1")
+    yield SimpleNamespace(zoos=place / "zoos", checkpoints=place / "checkpoints", zoo=zoo)
+    tasks.get.cache_clear()
 
 
 @pytest.fixture
 def machine(shipped, tmp_path, monkeypatch):
     """A machine with nnit and nothing else, at toy size; gives the working folder."""
     toy_size(monkeypatch, ghns=2)
-    build_into(tmp_path / "built", monkeypatch)
-    monkeypatch.setattr(files, "EMBEDDED", shipped.zoos)
-    monkeypatch.setattr(files, "cached_assets_path", (tmp_path / "cache").joinpath)
-    monkeypatch.setattr(generator, "CHECKPOINTS", shipped.checkpoints)
+    shutil.copytree(shipped.zoos, tmp_path / "zoos")  # where `nnit-zoo build` writes, too
+    monkeypatch.setattr(places, "DATA", tmp_path / "zoos")
+    tasks.get.cache_clear()
+    monkeypatch.setattr(places, "cached_assets_path", (tmp_path / "cache").joinpath)
+    monkeypatch.setattr(registry, "CHECKPOINTS", shipped.checkpoints)
     find = results.find
     monkeypatch.setattr(results, "find", lambda folders: find(set(folders) - {results.SHIPPED}))
     work = tmp_path / "work"
@@ -164,13 +164,10 @@ def machine(shipped, tmp_path, monkeypatch):
 
 @pytest.fixture
 def hub(shipped, monkeypatch):
-    """The zoo tests' stand-in for the Hub, with the toy zoo in the data set `owner/name`."""
-    spec = importlib.util.spec_from_file_location("zoo_conftest", ROOT / "tests" / "zoo" / "conftest.py")
-    stand_in = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(stand_in)
-    server = stand_in.Hub()
+    """The stand-in for the Hub, with the toy zoo in the data set `owner/name`."""
+    server = Hub()
     server.files["owner/name"] = {f"PickCube-v1/{path.name}": path.read_bytes() for path in shipped.zoo.iterdir()}
-    with stand_in.serving(server, monkeypatch):
+    with serving(server, monkeypatch):
         yield server
 
 

@@ -17,7 +17,7 @@ Generates the weights of small {task} policies, of a requested architecture. Tra
 architectures and training seeds of the `nnit` zoo.
 
 ```python
-from nnit_baselines.generator import SampleRequest, get
+from nnit_baselines import SampleRequest, get
 from nnit_zoo import tasks
 from nnit_zoo.architecture import Architecture
 

@@ -1,18 +1,12 @@
-"""What a generator of networks is, where it is found by name, and how its checkpoint is stored."""
+"""What a generator of networks is, and how its checkpoint is stored."""
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import inspect
 import json
-import sys
 import tempfile
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -26,30 +20,14 @@ from torch import Tensor
 from nnit_baselines.card import card
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_atomically, write_bytes, write_json
-from nnit_zoo.errors import UserError, unknown_name
+from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
-from nnit_zoo.zoo import TrainingView, Zoo
+from nnit_zoo.zoo import TrainingView
 
-BUILT_IN = {
-    "nnit": "nnit_baselines.nnit.generator:NNiT",
-    "ghn-oracle": "nnit_baselines.controls.stored:GHNOracle",
-    "zoo": "nnit_baselines.controls.stored:Stored",
-    "noise-0.03": "nnit_baselines.controls.stored:Noise003",
-    "noise-0.06": "nnit_baselines.controls.stored:Noise006",
-    "noise-0.1": "nnit_baselines.controls.stored:Noise01",
-    "mean": "nnit_baselines.controls.stored:Mean",
-    "crop": "nnit_baselines.controls.resized:Crop",
-    "nearest": "nnit_baselines.controls.resized:Nearest",
-    "random": "nnit_baselines.controls.initial:Random",
-}
-ENTRY_POINTS = "nnit.generators"
-CHECKPOINTS = Path(__file__).parent / "checkpoints"
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
 CARD = "README.md"
 METADATA = {"format": "pt"}
-FILE_MODULE = "nnit_method_"
-"""Begins the name of the module that a method's file becomes."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +60,8 @@ class Capabilities:
 
 
 @dataclass(frozen=True)
-class Run:
-    """How a `fit` runs; controls, which have nothing to train, ignore it."""
+class FitOptions:
+    """How to fit; controls, which have nothing to train, ignore it."""
 
     steps: int | None = None
     """Optimiser steps; None = the method's own default."""
@@ -111,6 +89,8 @@ class Generator(ABC):
     """Name of the task that the networks solve; set by `fit`."""
     training_facts: Mapping[str, Any] = {}
     """What is known of the training, kept in config.json."""
+    sampling_steps: int | None = None
+    """In how many steps it samples; None for a method without such steps. `nnit-bench run --sampling-steps` sets it."""
 
     @classmethod
     def from_preset(cls, name: str) -> Self:
@@ -118,7 +98,7 @@ class Generator(ABC):
         raise UserError(f"{cls.__name__} has no presets, so none named '{name}'")
 
     @abstractmethod
-    def fit(self, view: TrainingView, run: Run | None = None) -> None:
+    def fit(self, view: TrainingView, options: FitOptions | None = None) -> None:
         """Learn from the policies of a view; raises UserError for a reference view unless this is an oracle."""
 
     def supports(self, architecture: Architecture) -> bool:
@@ -163,6 +143,8 @@ class Generator(ABC):
 
         Raises UserError if `config` has a key of ours: method, task or training.
         """
+        from nnit_baselines.registry import address  # noqa: PLC0415  which imports this module
+
         folder, kind, own = Path(folder), type(self), self.config()
         config = {"method": kind.__name__, "task": self.task, "training": dict(self.training_facts)}
         if taken := sorted(config.keys() & own.keys()):
@@ -170,7 +152,7 @@ class Generator(ABC):
         config, tensors = config | own, self.tensors()
         write_atomically(folder / WEIGHTS, lambda path: safetensors.torch.save_file(tensors, path, METADATA))
         write_json(folder / CONFIG, config)
-        text = card(kind.__name__, _address(kind), self.task, self.training_facts, self.licence)
+        text = card(kind.__name__, address(kind), self.task, self.training_facts, self.licence)
         write_bytes(folder / CARD, text.encode())
 
     @classmethod
@@ -220,110 +202,6 @@ def check_batch(name: str, batch: object) -> PolicyBatch:
     if any(layer.requires_grad for layer in batch.layers):
         raise UserError(f"{name} gave layers that require a gradient; sample under torch.inference_mode()")
     return batch
-
-
-def names() -> tuple[str, ...]:
-    """The names of all generators: built in, and installed under the entry-point group `nnit.generators`."""
-    return tuple(sorted({*BUILT_IN, *entry_points(group=ENTRY_POINTS).names}))
-
-
-def available() -> dict[str, type[Generator]]:
-    """The classes of all names; an installed plug-in that cannot be loaded is left out with a warning."""
-    found = {}
-    for name in names():
-        try:
-            found[name] = get(name)
-        except UserError as error:
-            warnings.warn(f"method {name} is left out: {error}", stacklevel=2)
-    return found
-
-
-def get(name: str) -> type[Generator]:
-    """The generator class with this name, or at `package.module:Class` or `path/to/file.py:Class`.
-
-    A file finds modules beside it, and a module those of the current folder. Raises UserError, with near names, if
-    there is no such class.
-    """
-    if name in BUILT_IN:
-        return _load(BUILT_IN[name])
-    installed = entry_points(group=ENTRY_POINTS)
-    if name in installed.names:
-        return _load(installed[name].value)
-    if name.endswith(".py"):
-        raise UserError(f"'{name}' names no class; write {name}:ClassName")
-    if ":" not in name:
-        raise unknown_name("method", name, names())
-    place, _, _ = name.rpartition(":")
-    folder = str(Path(place).resolve().parent if place.endswith(".py") else Path.cwd())
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    return _load(name)
-
-
-def checkpoint(name: str, task: str) -> Path | None:
-    """The folder of the checkpoint of this method and task that ships with the package, if there is one."""
-    folder = CHECKPOINTS / name / task
-    return folder if (folder / CONFIG).is_file() else None
-
-
-def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None, seed: int = 0) -> Generator:
-    """The generator called `name`, ready to sample networks of `split` for the zoo's task.
-
-    A trained method is read from `source`, by default from its shipped checkpoint; others are fitted here, with `seed`.
-    Raises UserError if there is no checkpoint, or it is for another task.
-    """
-    kind = get(name)
-    if not kind.capabilities.checkpoint:
-        generator = kind()
-        generator.fit(zoo.reference_view(split) if kind.capabilities.oracle else zoo.training_view(), Run(seed=seed))
-        return generator
-    found = source or checkpoint(name, zoo.task)
-    if found is None:
-        raise UserError(
-            f"no checkpoint of {name} for {zoo.task} ships with nnit; "
-            f"train one with: nnit-bench train --method {name} --task {zoo.task}"
-        )
-    return kind.from_pretrained(found, zoo.task)
-
-
-def _load(address: str) -> type[Generator]:
-    """The class at `module:Class` or `file.py:Class`."""
-    place, _, attribute = address.rpartition(":")
-    try:
-        module = _run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
-    except UserError:
-        raise
-    except Exception as error:  # somebody else's code, which may fail in any way
-        raise UserError(f"cannot load method '{address}': {type(error).__name__}: {error}") from error
-    found = getattr(module, attribute, None)
-    if found is None:
-        raise unknown_name(f"class in {place}", attribute, [name for name in vars(module) if name[0].isupper()])
-    if not (isinstance(found, type) and issubclass(found, Generator)):
-        raise UserError(f"'{address}' is not a subclass of nnit_baselines.generator.Generator")
-    if missing := sorted(found.__abstractmethods__):
-        raise UserError(f"'{address}' does not define {' and '.join(missing)}")
-    if not isinstance(getattr(found, "capabilities", None), Capabilities):
-        raise UserError(f"'{address}' does not declare what it can do; set capabilities = Capabilities() in the class")
-    return found
-
-
-def _address(kind: type[Generator]) -> str:
-    """What `get` finds the class by: its name if it has one."""
-    if kind.__module__.startswith(FILE_MODULE):
-        return f"{Path(inspect.getfile(kind)).name}:{kind.__qualname__}"
-    address = f"{kind.__module__}:{kind.__qualname__}"
-    named = BUILT_IN | {each.name: each.value for each in entry_points(group=ENTRY_POINTS)}
-    return next((name for name, value in named.items() if value == address), address)
-
-
-def _run_file(path: Path) -> Any:
-    spec = importlib.util.spec_from_file_location(f"{FILE_MODULE}{path.stem}", path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise UserError(f"no such file: {path}")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look up their annotations
-    spec.loader.exec_module(module)
-    return module
 
 
 def _fetch(source: Path | str) -> Path:

@@ -8,19 +8,20 @@ from pathlib import Path
 import torch
 
 import nnit_zoo
-from nnit_baselines.generator import Generator, Run, get
+from nnit_baselines.generator import FitOptions, Generator
+from nnit_baselines.registry import get
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import MANIFEST, sha256_of
 from nnit_zoo.provenance import commit
 
 
 def train(
-    method: str, task: str, run: Run, output: Path, zoo_folder: Path | None = None, preset: str | None = None
+    method: str, task: str, options: FitOptions, output: Path, zoo_folder: Path | None = None, preset: str | None = None
 ) -> Generator:
     """Fit `method` on the task's training view and write config.json, model.safetensors and README.md to `output`.
 
-    An interrupted run goes on from `run.folder`. Raises UserError for an unknown method or preset, a method that needs
-    no training, or a missing zoo.
+    An interrupted run goes on from `options.folder`. Raises UserError for an unknown method or preset, a method that
+    needs no training, or a missing zoo.
     """
     kind = get(method)
     if not kind.capabilities.checkpoint:
@@ -28,11 +29,11 @@ def train(
     zoo = nnit_zoo.load(task, zoo_folder)
     view = zoo.training_view()
     generator = kind() if preset is None else kind.from_preset(preset)
-    generator.fit(view, run)
+    generator.fit(view, options)
     generator.training_facts = {
         **generator.training_facts,
-        "seed": run.seed,
-        **({} if run.steps is None else {"steps": run.steps}),
+        "seed": options.seed,
+        **({} if options.steps is None else {"steps": options.steps}),
         **({} if preset is None else {"preset": preset}),
         "policies": len(view),
         "zoo_manifest_sha256": sha256_of(zoo.folder / MANIFEST),

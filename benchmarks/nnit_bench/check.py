@@ -18,9 +18,10 @@ import torch
 
 from nnit_baselines.controls.initial import Random
 from nnit_baselines.controls.resized import resize
-from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest, check_batch, get
+from nnit_baselines.generator import Capabilities, FitOptions, Generator, SampleRequest, check_batch
+from nnit_baselines.registry import get
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.cli import Json
+from nnit_zoo.console import Json
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView
@@ -163,7 +164,7 @@ def _made(subject: Subject) -> None:
 @clause("fit refuses a reference view.", applies=lambda subject: not subject.kind.capabilities.oracle)
 def _refuses_reference(subject: Subject) -> None:
     try:
-        subject.kind().fit(synthetic_view(reference=True), Run(steps=STEPS))
+        subject.kind().fit(synthetic_view(reference=True), FitOptions(steps=STEPS))
     except UserError:
         return
     raise Broken("it learned from yardsticks; begin fit with: refuse_reference(view)")
@@ -172,7 +173,7 @@ def _refuses_reference(subject: Subject) -> None:
 @clause("fit learns from a view and keeps the name of its task.", needed=True)
 def _fits(subject: Subject) -> None:
     generator = subject.kind()
-    generator.fit(subject.view, Run(steps=STEPS))
+    generator.fit(subject.view, FitOptions(steps=STEPS))
     if generator.task != subject.view.task:
         raise Broken(f"after fit, task is '{generator.task}', not '{subject.view.task}'; set: self.task = view.task")
     subject.generator = generator
@@ -248,7 +249,7 @@ def _varies(subject: Subject) -> None:
 @clause("Fitting and sampling leave the policies and the global random numbers as they are.")
 def _leaves_alone(subject: Subject) -> None:
     policies, state = _hash(subject.view), _global_state()
-    subject.kind().fit(subject.view, Run(steps=STEPS))
+    subject.kind().fit(subject.view, FitOptions(steps=STEPS))
     culprit = "fit"
     for name, ask in {"": None, **subject.ways()}.items():
         if ask is not None:

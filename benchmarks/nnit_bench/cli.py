@@ -6,19 +6,19 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from nnit_bench.execution import Execution
 from nnit_zoo.cli import run as run_application
-from nnit_zoo.console import print_json
+from nnit_zoo.console import Json, Names, print_json
 from nnit_zoo.errors import UserError
 
 if TYPE_CHECKING:
-    from nnit_bench.protocol import Protocol
     from nnit_bench.tables import Results
     from nnit_zoo.display import Display
     from nnit_zoo.tasks.task import Simulator, Task
@@ -36,135 +36,86 @@ app.command("nnit_bench.check:check", name="check", help="Say whether a method k
 app.command("nnit_bench.report:report", name="report", help="Write all stored results as tables and figures.")
 app.command("nnit_bench.paper:reproduce", name="reproduce", help="Print a table of the paper with our rows in it.")
 
-Json = Annotated[bool, Parameter(name="--json")]
-Names = Annotated[tuple[str, ...], Parameter(show_default=lambda names: ", ".join(names) or "all")]
 
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class What:
-    """What is scored; the defaults are the benchmark's. For several names, repeat an option or use commas."""
-
-    method: Names = ("nnit",)
-    """Name, package.module:Class or path/to/file.py:Class of a generator."""
-    task: Names = ("PickCube-v1",)
-    """The task to score on."""
-    split: Names = ("unseen",)
-    """The architectures to generate policies for: unseen, seen, excluded; joint, where the generator chooses them; or
-    beyond the zoo's, offgrid, wide, deep, shallow."""
-    policies: int | None = None
-    """Policies per architecture, or in all on joint; by default 10, and 100 in all on the seen split and on joint."""
-    episodes: int | None = None
-    """Episodes per policy; by default the task's number, 50 for a robot task."""
-    seed: int = 0
-    """Seed of the generator's sampling."""
-    architecture: Names = ()
-    """Only this architecture of the split, such as 32-32-16-64."""
-    protocol: Literal["paper", "heldout"] = "heldout"
-    """How the ten best are scored: on the episodes that selected them, as in the paper, or on others as well."""
-    sim: Literal["fast", "stock", "stock-gpu"] = "fast"
-    """What plays a robot task's episodes: ours, or plain ManiSkill on a CPU or a GPU (the last is untested)."""
-    steps: int | None = None
-    """Sampling steps, for a method that takes them."""
-    checkpoint: str | None = None
-    """Checkpoint folder, or id on the Hugging Face Hub; by default the checkpoint that ships with nnit."""
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class How:
-    """How it is done; none of this changes a number."""
-
-    workers: int = 2
-    """Processes that simulate."""
-    parallel: Literal["processes", "ray"] = "processes"
-    """Where they run: on this machine, or on a Ray cluster."""
-    output: Path = Path("results")
-    """Folder of the result files."""
-    overwrite: Literal["never", "missing", "always"] = "missing"
-    """Whether to do what has been done: missing finishes what is unfinished, never leaves it, always repeats all."""
-    as_json: Json = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print no progress and no notes."""
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Shot:
-    """Whose episode is filmed; the defaults are the first policies and the first episode that `run` scores."""
-
-    method: str = "nnit"
-    """Name, package.module:Class or path/to/file.py:Class of a generator."""
-    task: str = "PickCube-v1"
-    """A robot task."""
-    split: str = "unseen"
-    """The architectures to generate policies for, as of `run`."""
-    architecture: Names = ()
-    """Only this architecture of the split, such as 32-32-16-64."""
-    policies: int = 1
-    """Policies per architecture, or in all on joint."""
-    episode_seed: int | None = None
-    """Seed of the episode, as in a run's episodes.parquet."""
-    seed: int = 0
-    """Seed of the generator's sampling."""
-    checkpoint: str | None = None
-    """Checkpoint folder, or id on the Hugging Face Hub; by default the checkpoint that ships with nnit."""
-    output: Path = Path("renders")
-    """Folder of the pictures."""
-    quiet: bool = False
-    """Print no progress."""
-
-
-DEFAULT_WHAT, DEFAULT_HOW, DEFAULT_SHOT = What(), How(), Shot()
+DEFAULT_EXECUTION = Execution()
 
 
 @app.command
-def run(*, what: What = DEFAULT_WHAT, how: How = DEFAULT_HOW) -> None:
+def run(
+    *,
+    method: Names = ("nnit",),
+    task: Names = ("PickCube-v1",),
+    split: Names = ("unseen",),
+    policies: int | None = None,
+    episodes: int | None = None,
+    seed: int = 0,
+    architecture: Names = (),
+    protocol: Literal["paper", "heldout"] = "heldout",
+    sim: Literal["fast", "stock", "stock-gpu"] = "fast",
+    sampling_steps: int | None = None,
+    checkpoint: str | None = None,
+    execution: Annotated[Execution, Parameter(name="*")] = DEFAULT_EXECUTION,
+    as_json: Json = False,
+    quiet: bool = False,
+) -> None:
     """Generate policies with a method, score them, and print the table.
 
     A finished run is kept under results/ and found again: the same command prints it at once. An interrupted one goes
-    on where it stopped. Exit code 1 means that a run failed, 2 that the command makes no sense.
-    """
-    from nnit_baselines import generator
-    from nnit_bench import runner, tables
-    from nnit_zoo import display
+    on where it stopped. For several names, repeat an option or use commas. Exit code 1 means that a run failed, 2 that
+    the command makes no sense.
 
-    methods, tasks, splits = (_names(each) for each in (what.method, what.task, what.split))
-    for name in methods:
-        generator.get(name)  # a wrong name is told now, not after the work for the names before it
-    if not (methods and tasks and splits):
-        raise UserError("--method, --task and --split each need a name")
-    if what.checkpoint and len(methods) * len(tasks) > 1:
+    Args:
+        method: Name, package.module:Class or path/to/file.py:Class of a generator.
+        task: The task to score on.
+        split: The architectures to generate policies for: unseen, seen, excluded; joint, where the generator chooses
+            them; or beyond the zoo's, offgrid, wide, deep, shallow.
+        policies: Policies per architecture, or in all on joint; by default 10, and 100 in all on the seen split and on
+            joint.
+        episodes: Episodes per policy; by default the task's number, 50 for a robot task.
+        seed: Seed of the generator's sampling.
+        architecture: Only this architecture of the split, such as 32-32-16-64.
+        protocol: How the ten best are scored: on the episodes that selected them, as in the paper, or on others as
+            well.
+        sim: What plays a robot task's episodes: ours, or plain ManiSkill on a CPU or a GPU (the last is untested).
+        sampling_steps: Sampling steps, for a method that takes them.
+        checkpoint: Checkpoint folder, or id on the Hugging Face Hub; by default the checkpoint that ships with nnit.
+        execution: How it is done; none of this changes a number.
+        as_json: Print JSON instead of tables.
+        quiet: Print no progress and no notes.
+    """
+    from nnit_baselines import registry
+    from nnit_bench import runner, tables
+    from nnit_bench.protocol import Protocol
+    from nnit_zoo.display import Display
+
+    for name in method:
+        registry.get(name)  # a wrong name is told now, not after the work for the names before it
+    if checkpoint and len(method) * len(task) > 1:
         raise UserError("--checkpoint belongs to one --method and one --task")
-    if how.workers < 1:
-        raise UserError(f"--workers must be 1 or more, not {how.workers}")
-    screen = display.Display(how.quiet)
-    chosen = [_task(name, what.sim) for name in tasks]
-    protocols = {task: [_protocol(task, split, what) for split in splits] for task in chosen}
-    execution = runner.Execution(
-        output=how.output,
-        stage=screen.stage,
-        workers=how.workers,
-        parallel=how.parallel,
-        overwrite=how.overwrite,
+    if execution.workers < 1:
+        raise UserError(f"--workers must be 1 or more, not {execution.workers}")
+    screen = Display(quiet)
+    protocol_of = partial(
+        Protocol.of, selection=protocol, policies=policies, only=architecture, episodes=episodes, seed=seed
     )
-    zoos = {task: _zoo(task.name, screen) for task in chosen}
+    tasks = [_task(name, sim) for name in task]
+    protocols = {each: [protocol_of(each, name) for name in split] for each in tasks}
+    zoos = {each: _zoo(each.name, screen) for each in tasks}
     results, errors = [], []
-    for task, zoo in zoos.items():
-        for protocol in protocols[task]:
+    for scored, zoo in zoos.items():
+        for wanted in protocols[scored]:
             outcomes = []
-            for name in methods:
+            for name in method:
                 try:
-                    entrant = runner.enter(name, zoo, protocol, checkpoint=what.checkpoint, steps=what.steps)
-                    outcomes.append(runner.run(task, zoo, entrant, protocol, execution))
+                    entry = runner.enter(name, zoo, wanted, checkpoint=checkpoint, sampling_steps=sampling_steps)
+                    outcomes.append(runner.run(scored, zoo, entry, wanted, execution, screen.stage))
                 except UserError as error:  # the others' work should not be lost to it
-                    errors.append(f"{name} on {protocol.task}, {protocol.split}: {error}")
+                    errors.append(f"{name} on {wanted.task}, {wanted.split}: {error}")
                 except Exception as error:  # nor to a crash, whose place its author needs
                     traceback.print_exc()
-                    errors.append(f"{name} on {protocol.task}, {protocol.split}: {type(error).__name__}: {error}")
-            results.append(tables.Results(protocol, outcomes, runner.zoo_row(zoo.index, protocol)))
-    if how.as_json:
+                    errors.append(f"{name} on {wanted.task}, {wanted.split}: {type(error).__name__}: {error}")
+            results.append(tables.Results(wanted, outcomes, runner.zoo_row(zoo.index, wanted)))
+    if as_json:
         print_json({"tables": [tables.plain(each) for each in results], "errors": errors})
     else:
         _print(results, screen)
@@ -197,65 +148,91 @@ def train(
         trackio: Project of trackio that the training's log also goes to, live; needs the extra `trackio`.
         quiet: Print no progress and no notes.
     """
-    from nnit_baselines import generator, training
+    from nnit_baselines import registry, training
+    from nnit_baselines.generator import FitOptions
     from nnit_bench.records import folder_name
     from nnit_zoo import tasks
     from nnit_zoo.display import Display
 
     task = tasks.get(task).name
-    generator.get(method)
+    registry.get(method)
     folder = output or Path("runs") / folder_name(method) / task
     screen = Display(quiet)
     zoo = _zoo(task, screen)
     name = f"{folder_name(method)}-{task}-{seed}"
     with _tracking(trackio, name) as track, screen.steps(f"training {method}") as progress:
-        settings = generator.Run(steps=steps, seed=seed, folder=folder / "state", progress=progress, track=track)
-        training.train(method, task, settings, folder, zoo.folder, preset)
+        options = FitOptions(steps=steps, seed=seed, folder=folder / "state", progress=progress, track=track)
+        training.train(method, task, options, folder, zoo.folder, preset)
     sys.stdout.write(f"{folder}\n")
     screen.note(f"score it with: nnit-bench run --method {method} --task {task} --checkpoint {folder}")
 
 
 @app.command
-def render(*, shot: Shot = DEFAULT_SHOT) -> None:
+def render(
+    *,
+    method: str = "nnit",
+    task: str = "PickCube-v1",
+    split: str = "unseen",
+    architecture: Names = (),
+    policies: int = 1,
+    episode_seed: int | None = None,
+    seed: int = 0,
+    checkpoint: str | None = None,
+    output: Path = Path("renders"),
+    quiet: bool = False,
+) -> None:
     """Film generated policies at work: an MP4 of all side by side, and a PNG with a snapshot every ten steps.
 
     The episodes are those that `run` scores, replayed in ManiSkill. A machine without a GPU needs `make render-setup`.
+
+    Args:
+        method: Name, package.module:Class or path/to/file.py:Class of a generator.
+        task: A robot task.
+        split: The architectures to generate policies for, as of `run`.
+        architecture: Only this architecture of the split, such as 32-32-16-64.
+        policies: Policies per architecture, or in all on joint; by default the first that `run` scores.
+        episode_seed: Seed of the episode, as in a run's episodes.parquet; by default the first that `run` scores.
+        seed: Seed of the generator's sampling.
+        checkpoint: Checkpoint folder, or id on the Hugging Face Hub; by default the checkpoint that ships with nnit.
+        output: Folder of the pictures.
+        quiet: Print no progress.
     """
-    task = _task(shot.task, "fast")  # before what the simulator's extra brings is imported
+    found = _task(task, "fast")  # before what the simulator's extra brings is imported
 
     from nnit_bench import film, runner
     from nnit_bench.protocol import Protocol
     from nnit_bench.records import folder_name
+    from nnit_zoo.atomic import write_bytes
     from nnit_zoo.display import Display
     from nnit_zoo.sim.render import camera
 
-    screen = Display(shot.quiet)
-    task = film.robot_task(task)
-    protocol = Protocol.of(task, shot.split, only=_names(shot.architecture), seed=shot.seed)
-    seed = protocol.select.first if shot.episode_seed is None else shot.episode_seed
-    with camera(task.name) as take:  # what cannot render is told before any other work
-        zoo = _zoo(task.name, screen)
-        entrant = runner.enter(shot.method, zoo, protocol, checkpoint=shot.checkpoint)
-        policies = film.choose(task, entrant, protocol, shot.policies, screen.stage)
+    screen = Display(quiet)
+    robot = film.robot_task(found)
+    protocol = Protocol.of(robot, split, only=architecture, seed=seed)
+    episode = protocol.select.first if episode_seed is None else episode_seed
+    with camera(robot.name) as take:  # what cannot render is told before any other work
+        zoo = _zoo(robot.name, screen)
+        entry = runner.enter(method, zoo, protocol, checkpoint=checkpoint)
+        chosen = film.choose(robot, entry, protocol, policies, screen.stage)
         scenes = []
-        with screen.stage(f"{task.name}: filming", len(policies)) as advance:
-            for title, policy in policies:
-                scenes.append(film.shoot(task, policy, seed, title, take))
+        with screen.stage(f"{robot.name}: filming", len(chosen)) as advance:
+            for title, policy in chosen:
+                scenes.append(film.shoot(robot, policy, episode, title, take))
                 advance(1)
     for suffix, make in ((".png", film.strip), (".mp4", film.video)):
-        path = shot.output / f"{task.name}-{folder_name(shot.method)}{suffix}"
-        film.write(path, make(scenes))
+        path = output / f"{robot.name}-{folder_name(method)}{suffix}"
+        write_bytes(path, make(scenes))
         sys.stdout.write(f"{path}\n")
 
 
 @app.command(name="list")
 def list_names(*, as_json: Json = False) -> None:
     """List the methods and tasks, and which checkpoints ship with nnit."""
-    from nnit_baselines import generator
+    from nnit_baselines import registry
     from nnit_zoo import tasks
 
-    found = generator.available()
-    methods = {name: [task for task in tasks.names() if generator.checkpoint(name, task)] for name in found}
+    found = registry.available()
+    methods = {name: [task for task in tasks.names() if registry.checkpoint(name, task)] for name in found}
     if as_json:
         print_json({"methods": methods, "tasks": tasks.names()})
         return
@@ -289,25 +266,6 @@ def _tracking(project: str | None, name: str) -> Iterator[Callable[[dict[str, fl
     finally:
         with redirect_stdout(sys.stderr):
             trackio.finish()
-
-
-def _names(texts: tuple[str, ...]) -> list[str]:
-    """The names in an option that may be repeated and may hold commas."""
-    return [name for text in texts for name in text.split(",") if name]
-
-
-def _protocol(task: Task, split: str, what: What) -> Protocol:
-    from nnit_bench.protocol import Protocol
-
-    return Protocol.of(
-        task,
-        split,
-        selection=what.protocol,
-        policies=what.policies,
-        only=_names(what.architecture),
-        episodes=what.episodes,
-        seed=what.seed,
-    )
 
 
 def _task(name: str, simulator: Simulator) -> Task:

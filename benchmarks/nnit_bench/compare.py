@@ -11,14 +11,14 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from nnit_bench import results, views
-from nnit_bench.protocol import Metric, Protocol
+from nnit_bench import results, scores
+from nnit_bench.protocol import Protocol
 from nnit_bench.results import FOLDERS, Folders, StoredRun
+from nnit_bench.scores import Scores
 from nnit_bench.statistics import Estimate, by_cluster, estimate
-from nnit_bench.views import Scores
-from nnit_zoo.cli import Json
-from nnit_zoo.console import print_json
+from nnit_zoo.console import Json, print_json
 from nnit_zoo.errors import UserError
+from nnit_zoo.tasks.metric import Metric
 
 NAMES = {"mean": "mean", "top": "top", "top_heldout": "held out"}
 
@@ -80,7 +80,7 @@ def differ(first: StoredRun, second: StoredRun) -> list[Difference]:
     ours, theirs = first.record.protocol, second.record.protocol
     if not ours.measures_like(theirs):
         raise UserError(f"{_what(ours)} and {_what(theirs)} are not measured alike and cannot be compared")
-    parts = {"mean": _paired([views.everything(run.episodes, run.record.protocol) for run in (first, second)], ours)}
+    parts = {"mean": _paired([scores.everything(run.episodes, run.record.protocol) for run in (first, second)], ours)}
     for name, both in _picked(first, second).items():
         parts[name] = _same_episodes(both)
     found = []
@@ -106,7 +106,7 @@ def _paired(both: Sequence[Scores], protocol: Protocol) -> tuple[Scores, Scores]
 
 def _picked(first: StoredRun, second: StoredRun) -> dict[str, tuple[Scores, Scores]]:
     """The selected policies of both, for each kind of selection that both have."""
-    mine, other = (views.selected(run.episodes, run.record.protocol) for run in (first, second))
+    mine, other = (scores.selected(run.episodes, run.record.protocol) for run in (first, second))
     return {
         name: (mine[name], other[name])
         for name in mine
@@ -124,11 +124,11 @@ def _difference(mine: Scores, other: Scores, metric: Metric, protocol: Protocol,
     values = [each.values[metric.column] for each in (mine, other)]
     if not drawn:
         tables = [values[0].mean(0, keepdims=True) - values[1].mean(0, keepdims=True)]
-    elif views.clusters(mine, protocol) is None:
+    elif scores.clusters(mine, protocol) is None:
         tables = [values[0], -values[1]]
     else:  # by_cluster sorts by name, so rows of the two are of the same architecture
         tables = [by_cluster(values[0], mine.architectures) - by_cluster(values[1], other.architectures)]
-    bounds = (-1.0, 1.0) if metric.unit == "%" else None
+    bounds = (-1.0, 1.0) if metric.bounds else None  # of a difference of two shares
     return estimate(tables, np.random.default_rng(0), drawn=drawn, bounds=bounds)
 
 
@@ -147,14 +147,10 @@ def _print(runs: Sequence[StoredRun], differences: Sequence[Difference]) -> None
         table.add_column(heading, justify="left" if heading in ("score", "") else "right", overflow="fold")
     for each in differences:
         metric = metrics[each.metric]
-        scale = 100 if metric.unit == "%" else 1
-        value, low, high = (
-            f"{x * scale:+.1f}" for x in (each.difference.value, each.difference.low, each.difference.high)
-        )
-        scores = (f"{score * scale:.1f}" for score in (each.first, each.second))
-        label = f"{metric.label}{', %' * (metric.unit == '%')}"
+        both = (f"{value * metric.scale:.1f}" for value in (each.first, each.second))
         name = NAMES[each.statistic] if each.statistic != "top" else f"top-{protocol.top}"
-        table.add_row(label, name, *scores, f"{value}\n{low} to {high}", "yes" if each.separable else "no")
+        change = "\n".join(each.difference.text(metric.scale, signed=True))
+        table.add_row(metric.heading, name, *both, change, "yes" if each.separable else "no")
     console.print(
         f"{protocol.task}, {protocol.split}: {first} against {second}, on shared architectures and episodes\n"
     )
@@ -164,14 +160,15 @@ def _print(runs: Sequence[StoredRun], differences: Sequence[Difference]) -> None
 
 def in_words(first: str, second: str, difference: Difference, metric: Metric) -> str:
     """What a difference of means says, as a sentence."""
-    scale, unit = (100, " points") if metric.unit == "%" else (1, "")
-    change = difference.difference
-    interval = f"95 % interval {change.low * scale:.1f} to {change.high * scale:.1f}"
+    unit = " points" if metric.unit == "%" else ""
+    value, interval = difference.difference.text(metric.scale, signed=True)
     if not difference.separable:
-        return f"{first} and {second} cannot be told apart in mean {metric.label}: the {interval}{unit} holds zero."
-    word = "above" if change.value > 0 else "below"
-    size = abs(change.value) * scale
-    return f"{first} is {word} {second} in mean {metric.label} by {size:.1f}{unit} ({interval}): separable."
+        return (
+            f"{first} and {second} cannot be told apart in mean {metric.label}: "
+            f"the 95 % interval {interval}{unit} holds zero."
+        )
+    word, size = "below" if value.startswith("-") else "above", value.lstrip("+-")
+    return f"{first} is {word} {second} in mean {metric.label} by {size}{unit} (95 % interval {interval}): separable."
 
 
 def _name(run: StoredRun, runs: Sequence[StoredRun]) -> str:

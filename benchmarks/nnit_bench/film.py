@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
@@ -13,7 +12,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from nnit_bench import runner
 from nnit_bench.protocol import Protocol
-from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.sim.control import Controller
@@ -46,19 +44,19 @@ def robot_task(task: Task) -> RobotPolicyTask:
 
 
 def choose(
-    task: Task, entrant: runner.Contestant, protocol: Protocol, count: int, stage: runner.Stage
+    task: Task, entry: runner.Entry, protocol: Protocol, count: int, stage: runner.Stage
 ) -> list[tuple[str, PolicyBatch]]:
     """The first `count` policies of each architecture, or of all on `joint`, with a title each.
 
     All of the protocol's policies are sampled: what a generator gives as the first may depend on how many are wanted.
     Raises UserError if the generator cannot make them or there are not that many.
     """
-    if entrant.unsupported:
-        raise UserError(f"{entrant.method.name} {entrant.unsupported}")
+    if entry.unsupported:
+        raise UserError(f"{entry.method.name} {entry.unsupported}")
     most = max(protocol.policies.values())
     if not 1 <= count <= most:
         raise UserError(f"--policies must be from 1 to {most}, not {count}")
-    batches = runner.sample(task, entrant, protocol, stage)
+    batches = runner.sample(task, entry, protocol, stage)
     chosen = [
         (f"{batch.architecture}" + f" #{index}" * (count > 1), policy)
         for batch in batches
@@ -122,15 +120,3 @@ def video(scenes: Sequence[Scene]) -> bytes:
         pictures.append(np.asarray(image))
     content: bytes = imageio.imwrite("<bytes>", np.stack(pictures), extension=".mp4", fps=STEPS_PER_SECOND)
     return content
-
-
-def write(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all; raises UserError if it cannot be written."""
-
-    def fill(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    try:
-        write_atomically(path, fill)
-    except OSError as error:
-        raise UserError(f"cannot write {path} ({error.strerror}); choose another folder with --output") from None

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from nnit_bench.records import Distance, Novelty
 from nnit_zoo.architecture import SPLITS, Architecture, split_of
+from nnit_zoo.diversity import cosines, distances, pairs
 from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.tasks.task import Task
 from nnit_zoo.zoo import Zoo, policy_hashes
@@ -49,9 +50,9 @@ def measure(task: Task, zoo: Zoo, batches: Sequence[PolicyBatch]) -> tuple[Novel
         for batch in batches
         if batch.architecture in there
     ]
-    distances = _distances(task, zoo, [*batches, *heldout])
+    nearest = _distances(task, zoo, [*batches, *heldout])
     policies = [(str(batch.architecture), sha256) for batch in batches for sha256 in policy_hashes(batch)]
-    rows, yardstick = distances[: len(policies)], distances[len(policies) :]
+    rows, yardstick = nearest[: len(policies)], nearest[len(policies) :]
     found = {name: _compare(name, rows, yardstick) for name in ("same_architecture", "any_architecture", "actions")}
     copies = sum(_is_copy(row) for row in rows)
     l2, cosine = _pairwise(batches)
@@ -215,11 +216,9 @@ def _is_copy(row: dict[str, Any]) -> bool:
 
 def _pairwise(batches: Sequence[PolicyBatch]) -> tuple[float | None, float | None]:
     """Mean L2 distance and cosine similarity over all pairs of finite policies that share an architecture."""
-    l2, cosine = [], []
-    for batch in batches:
-        flat = batch[torch.nonzero(batch.finite()).flatten().tolist()].flat().double()
-        if len(flat) > 1:
-            l2.append(torch.pdist(flat))
-            unit = torch.nn.functional.normalize(flat)
-            cosine.append((unit @ unit.T)[tuple(torch.triu_indices(len(flat), len(flat), 1))])
-    return (float(torch.cat(l2).mean()), float(torch.cat(cosine).mean())) if l2 else (None, None)
+    finite = [batch[torch.nonzero(batch.finite()).flatten().tolist()] for batch in batches]
+    several = [batch for batch in finite if len(batch) > 1]
+    if not several:
+        return None, None
+    l2, cosine = (torch.cat([pairs(of(batch)) for batch in several]) for of in (distances, cosines))
+    return float(l2.mean()), float(cosine.mean())

@@ -16,12 +16,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from nnit_bench import results, views
+from nnit_bench import results, scores
 from nnit_bench.results import FOLDERS, Folders, StoredRun
 from nnit_bench.statistics import Estimate
-from nnit_zoo import files
-from nnit_zoo.cli import Json
-from nnit_zoo.console import print_json
+from nnit_zoo import places
+from nnit_zoo.console import Json, print_json
 
 Name = Literal["main", "full-distribution", "joint", "mnist"]
 ROBOT_TASKS = ("PickCube-v1", "PushCube-v1", "StackCubeEasy-v1")
@@ -74,7 +73,7 @@ class Number:
     def __str__(self) -> str:
         """The value, and below it its spread or interval."""
         if self.low is not None and self.high is not None:
-            return f"{self.value:.1f}\n{self.low:.1f}-{self.high:.1f}".replace("100.0", "100")
+            return "\n".join(Estimate(self.value, self.low, self.high).text()).strip()
         return f"{self.value:g}" if self.spread is None else f"{self.value:.2f}\n±{self.spread:.2f}"
 
 
@@ -172,9 +171,9 @@ def full_distribution(runs: Latest) -> list[Table]:
 
 def joint(runs: Latest) -> list[Table]:
     """The paper's table 3 and its appendix on what was chosen: architecture and weights together."""
-    scores = Table("NNiT table 3: 100 policies of its own architectures, the ten best", _return_and_success())
-    scores.rows.append(Row("NNiT", "paper", _paper_cells(JOINT)))
-    scores.rows.append(Row("NNiT", "here", _ours(scores, runs, "NNiT", "joint", "top")))
+    selected = Table("NNiT table 3: 100 policies of its own architectures, the ten best", _return_and_success())
+    selected.rows.append(Row("NNiT", "paper", _paper_cells(JOINT)))
+    selected.rows.append(Row("NNiT", "here", _ours(selected, runs, "NNiT", "joint", "top")))
     columns = ("different\narchitectures", "of the 8\nunseen", "functional, %", "different\nin top-10")
     chosen = Table("NNiT appendix 'Architecture Diversity under Joint Sampling': PickCube-v1", columns)
     chosen.rows.append(Row("NNiT", "paper", tuple(Number(value) for value in JOINT_ARCHITECTURES)))
@@ -183,7 +182,7 @@ def joint(runs: Latest) -> list[Table]:
     numbers = (found.distinct, found.unseen, found.functional * 100, found.distinct_in_top) if found else None
     cells = tuple(map(Number, numbers)) if numbers else (None,) * len(columns)
     chosen.rows.append(Row("NNiT", "here", cells))
-    return [scores, chosen]
+    return [selected, chosen]
 
 
 def mnist(runs: Latest) -> list[Table]:
@@ -193,7 +192,7 @@ def mnist(runs: Latest) -> list[Table]:
     cells: tuple[Number | None, ...] = (None, None)
     run = _find(table, runs, MNIST, "unseen", "NNiT")
     if run and run.record.results:
-        accuracy = views.everything(run.episodes, run.record.protocol).values[RETURN].mean(1)
+        accuracy = scores.everything(run.episodes, run.record.protocol).values[RETURN].mean(1)
         mean = Number.of(run.record.results.estimates[RETURN]["mean"], 100)
         cells = (mean, Number(int((accuracy > 0.8).sum())))
     table.rows.append(Row("NNiT", "here", cells))
@@ -250,17 +249,17 @@ def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> Store
 
 
 def _methods() -> Sequence[str]:
-    from nnit_baselines import generator  # noqa: PLC0415  imports torch, which a complete table does not need
+    from nnit_baselines import registry  # noqa: PLC0415  imports torch, which a complete table does not need
 
-    return generator.names()
+    return registry.names()
 
 
 def _dataset() -> tuple[Number | None, ...]:
     """Mean return and success of each robot task's zoo, over its seen architectures."""
     cells: list[Number | None] = []
     for task in ROBOT_TASKS:
-        if task in files.tasks_with_zoo():
-            index = files.read_index(files.embedded(task) / files.INDEX)
+        if task in places.tasks_with_zoo():
+            _, index = places.shipped(task)
             seen = index.filter(pc.equal(index["split"], "seen"))
             for column, scale in ((RETURN, 1), (SUCCESS, 100)):
                 cells.append(Number(round(pc.mean(seen[column]).as_py() * scale, 1)))

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from nnit_zoo import architecture as zoo
+from nnit_zoo.architecture import hidden_widths
 from nnit_zoo.errors import UserError, unknown_name
+from nnit_zoo.tasks.metric import Metric
 
 if TYPE_CHECKING:
     from nnit_zoo.tasks.task import Task
@@ -58,18 +59,7 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Metric(_Frozen):
-    """A score of the task, and how people read it; the first of a protocol's is its headline."""
-
-    column: Literal["return", "success_once", "success_at_end"]
-    """Its column in the table of episodes."""
-    label: str
-    """Its name in tables."""
-    unit: Literal["%", ""]
-    """`%` for a share in [0, 1], which is shown times 100; empty for a number that is shown as it is."""
-
-
-class Episodes(_Frozen):
+class SeedRange(_Frozen):
     """The episodes of a phase: `count` seeds from `first` on."""
 
     first: int
@@ -101,9 +91,9 @@ class Protocol(_Frozen):
     """How many of the generated policies are selected (NNiT 6.3: 10)."""
     seed: int = 0
     """Seed of the generator's sampling, and its fitting if it has no checkpoint; episodes do not depend on it."""
-    select: Episodes
+    select: SeedRange
     """The episodes that every policy plays (NNiT 6.3: 50)."""
-    report: Episodes | None
+    report: SeedRange | None
     """The episodes that the selected play again; null under `paper`, and for a task whose episodes are a test set. Such
     a set is halved instead: selected on its even seeds, scored on the odd ones."""
 
@@ -137,13 +127,13 @@ class Protocol(_Frozen):
             task=task.name,
             task_version=task.version,
             simulator=task.simulator,
-            metrics=tuple(Metric(column=each.column, label=each.label, unit=each.unit) for each in task.metrics),
+            metrics=task.metrics,
             split=split,
             policies=policies_per_architecture(split, policies, only),
             selection=selection,
             seed=seed,
-            select=Episodes(first=select.start, count=len(select)),
-            report=Episodes(first=report.start, count=len(report)) if report and selection == "heldout" else None,
+            select=SeedRange(first=select.start, count=len(select)),
+            report=SeedRange(first=report.start, count=len(report)) if report and selection == "heldout" else None,
         )
 
     @property
@@ -163,7 +153,7 @@ def architectures(split: str) -> tuple[str, ...]:
         raise unknown_name("split", split, SPLITS)
     if split == "joint":
         return ()
-    return EXTENSIONS[split] if split in EXTENSIONS else zoo.hidden_widths(split)
+    return EXTENSIONS[split] if split in EXTENSIONS else hidden_widths(split)
 
 
 def policies_per_architecture(split: str, each: int | None = None, only: Sequence[str] = ()) -> dict[str, int]:

@@ -13,19 +13,10 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import inspect
 import json
-import os
-import platform
 import re
-import sys
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import PackageNotFoundError, distributions, version
-from importlib.util import find_spec
-from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,14 +25,13 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from nnit_bench.protocol import Protocol
-from nnit_bench.views import Summary
+from nnit_bench.provenance import Code, Hardware, installed_packages, this_machine
+from nnit_bench.scores import Summary
 from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import sha256_of
-from nnit_zoo.provenance import commit
 
 EPISODES, POLICIES, RECORD = "episodes.parquet", "policies.parquet", "run.json"
-EPISODE_SCHEMA = pa.schema(
+STORED_EPISODE_SCHEMA = pa.schema(
     [
         ("method", pa.string()),
         ("training_seed", pa.int64()),  # null for a method that is not trained
@@ -60,10 +50,6 @@ EPISODE_SCHEMA = pa.schema(
     ]
 )
 """The columns of episodes.parquet."""
-OUR_PACKAGES = ("nnit_zoo", "nnit_baselines", "nnit_bench")
-"""The packages whose source files are hashed into a run's id."""
-NUMERIC_PACKAGES = ("torch", "numpy", "mani_skill", "sapien")
-"""The packages whose versions can change a number; the record lists all that are installed."""
 
 
 class _Strict(BaseModel):
@@ -79,7 +65,7 @@ class Method(_Strict):
     config: dict[str, Any]
     """The generator's own settings, as config.json holds them; empty for one that has no checkpoint."""
     given: dict[str, Any]
-    """What the command set, on top of the method's defaults: `checkpoint`, `steps`."""
+    """What the command set, on top of the method's defaults: `checkpoint`, `sampling_steps`."""
     training: dict[str, Any]
     """Facts about its training, such as seed, seconds and machine; empty for a method that is not trained."""
     parameters: int | None
@@ -102,26 +88,6 @@ class ZooVersion(_Strict):
     """Policies of seen architectures and training seeds: what a generator may learn from."""
     seeds: int
     """Hypernetworks that these come from."""
-
-
-class Code(_Strict):
-    """The code that ran."""
-
-    sha256: str
-    """Of the source files of nnit_zoo, nnit_baselines and nnit_bench, and of a method given as a file."""
-    commit: str | None
-    """The checkout's commit."""
-    dirty: bool | None
-    """Whether the checkout had changes that are not in `commit`; both are null outside a checkout."""
-
-
-class Hardware(_Strict):
-    """The machine that ran it."""
-
-    machine: str
-    processor: str
-    cores: int
-    memory_gib: float
 
 
 class Timings(_Strict):
@@ -167,6 +133,10 @@ class Novelty(_Strict):
     """Mean cosine similarity between generated policies of one architecture."""
 
 
+HISTORY: Any = {"method": {"training": True, "given": {"checkpoint"}}}
+"""What an identity leaves out: how a method came to be what it is; its checkpoint's hash says what it is."""
+
+
 class Identity(BaseModel):
     """Everything that determines a run's episodes; the number of worker processes does not."""
 
@@ -178,8 +148,8 @@ class Identity(BaseModel):
 
     @property
     def run_id(self) -> str:
-        """The first 12 hexadecimal digits of the hash of all fields, but for how the method came to be what it is."""
-        text = json.dumps(self.model_dump(mode="json", exclude={"method": {"training", "given"}}), sort_keys=True)
+        """The first 12 hexadecimal digits of the hash of all fields, but for HISTORY."""
+        text = json.dumps(self.model_dump(mode="json", exclude=HISTORY), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def folder(self, output: Path) -> Path:
@@ -251,7 +221,7 @@ class RunRecord(_Strict):
         novelty: Novelty,
     ) -> RunRecord:
         """Write the tables, then the record with status `success`; returns that record."""
-        _write_table(folder / EPISODES, episodes.cast(EPISODE_SCHEMA))
+        _write_table(folder / EPISODES, episodes.cast(STORED_EPISODE_SCHEMA))
         _write_table(folder / POLICIES, policies)
         return self._close(folder, status="success", timings=timings, results=results, novelty=novelty)
 
@@ -276,11 +246,8 @@ def folder_name(method: str) -> str:
 
 
 def _write(path: Path, write: Callable[[Path], object]) -> None:
-    def fill(temporary: Path) -> None:
-        write(temporary)
-
     try:
-        write_atomically(path, fill)
+        write_atomically(path, write)
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         problem = "no space left" if full else f"cannot write ({error.strerror})"
@@ -298,73 +265,3 @@ def read_episodes(folder: Path) -> pa.Table:
         return pq.ParquetFile(folder / EPISODES).read()
     except (OSError, pa.ArrowInvalid) as error:
         raise UserError(f"{folder / EPISODES} is missing or damaged: {error}") from None
-
-
-@cache
-def installed_packages() -> dict[str, str]:
-    """Name and version of every installed package."""
-    versions = {each.metadata["Name"]: each.version for each in distributions()}
-    return dict(sorted(versions.items(), key=lambda item: item[0].lower()))
-
-
-def numeric_packages() -> dict[str, str]:
-    """Name and version of the installed packages that can change a number."""
-    found: dict[str, str] = {}
-    for name in NUMERIC_PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
-
-
-def hash_files(files: Mapping[str, Path]) -> str:
-    """SHA-256 over names and contents, in the order of the names."""
-    total = hashlib.sha256()
-    for name in sorted(files):
-        total.update(f"{name} {sha256_of(files[name])}\n".encode())
-    return total.hexdigest()
-
-
-def plugin_files(module: str) -> dict[str, Path]:
-    """Name -> source file of what a method in this loaded module is made of.
-
-    A package is all its files; a single file is itself and what it imports from beside it.
-    """
-    top = sys.modules[module.partition(".")[0]]
-    if hasattr(top, "__path__"):
-        roots = [Path(each) for each in top.__path__]
-        return {f"{root.name}/{path.relative_to(root)}": path for root in roots for path in root.rglob("*.py")}
-    file = Path(inspect.getfile(top))
-    if file.parent.name in ("site-packages", "dist-packages"):  # what is beside it is not its own
-        return {file.name: file}
-    finder = ModuleFinder([str(file.parent)], excludes=OUR_PACKAGES)
-    finder.run_script(str(file))
-    found = [Path(each) for module in finder.modules.values() if (each := vars(module)["__file__"])]
-    return {str(path.relative_to(file.parent)): path for path in found}
-
-
-def this_code(plugin: str | None = None) -> Code:
-    """The code that is running, with the module of a method that is not one of ours."""
-    files = {} if plugin is None else {f"method/{name}": path for name, path in plugin_files(plugin).items()}
-    for package in OUR_PACKAGES:
-        spec = find_spec(package)
-        assert spec is not None and spec.origin is not None
-        root = Path(spec.origin).parent
-        files |= {f"{package}/{path.relative_to(root)}": path for path in root.rglob("*.py")}
-    now = commit()
-    return Code(sha256=hash_files(files), commit=now.sha, dirty=now.dirty)
-
-
-def this_machine() -> Hardware:
-    """What this process runs on; memory in GiB."""
-    processor = platform.processor()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        match = re.search(r"model name\s*:\s*(.+)", cpuinfo.read_text())
-        processor = match.group(1) if match else processor
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return Hardware(
-        machine=f"{platform.system()} {platform.machine()}",
-        processor=processor,
-        cores=os.cpu_count() or 1,
-        memory_gib=round(memory, 1),
-    )

@@ -6,23 +6,24 @@ import csv
 import io
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nnit_bench import paper, results, views
+from nnit_bench import paper, results, scores
 from nnit_bench.compare import differ
-from nnit_bench.protocol import SPLITS, Metric
+from nnit_bench.protocol import SPLITS
 from nnit_bench.results import FOLDERS, Folders, StoredRun
 from nnit_bench.statistics import Estimate
-from nnit_zoo.atomic import write_atomically
-from nnit_zoo.cli import Json
+from nnit_zoo.atomic import write_atomically, write_bytes
+from nnit_zoo.console import Json
 from nnit_zoo.errors import UserError
+from nnit_zoo.tasks.metric import Metric
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-BARS = 16  # architectures that still fit a figure as bars
+LEVEL_NAMES = 16  # architectures whose names still fit below a figure unless they stand upright
 Group = list[StoredRun]
 """The runs of one task and split, a method each, the best first."""
 
@@ -43,11 +44,11 @@ def report(*, folders: Folders = FOLDERS, output: Path = Path("report"), as_json
     groups = _grouped(runs)
     content = json.dumps([_plain(run) for group in groups for run in group], indent=2) + "\n"
     figures = dict(_figures(groups))
-    _write(output / "report.json", content)
-    _write(output / "report.csv", _csv(groups))
-    _write(output / "report.md", _markdown(groups, figures))
+    write_bytes(output / "report.json", content.encode())
+    write_bytes(output / "report.csv", _csv(groups).encode())
+    write_bytes(output / "report.md", _markdown(groups, figures).encode())
     for name, figure in figures.items():
-        write_atomically(output / name, _saver(figure))
+        _save(figure, output / name)
     written = ["report.md", "report.json", "report.csv", *figures]
     sys.stdout.write(content if as_json else "".join(f"{output / name}\n" for name in written))
 
@@ -104,7 +105,7 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
         metric = protocol.metrics[0]
         parts.append(f"## {protocol.task}, {protocol.split}\n")
         parts.append(
-            f"Headline: {metric.label}{' in %' if metric.unit else ''}, with 95 % intervals. `tied`: cannot be told "
+            f"Headline: {metric.heading}, with 95 % intervals. `tied`: cannot be told "
             "apart from the first row. `nearest known`: median distance (relative L2) to the nearest policy that a "
             "known seed has for the architecture; in brackets as a multiple of that of held-out seeds. "
             "`shipped`: run by the project, not here.\n"
@@ -152,8 +153,8 @@ def _size(run: StoredRun, group: Group) -> str:
 def _cell(estimate: Estimate | None, metric: Metric) -> str:
     if estimate is None:
         return "-"
-    scale = 100 if metric.unit == "%" else 1
-    return f"{estimate.value * scale:.1f} ({estimate.low * scale:.1f} to {estimate.high * scale:.1f})"
+    value, interval = estimate.text(metric.scale)
+    return f"{value} ({interval})" if interval else value
 
 
 def _figure_names(group: Group) -> tuple[str, str]:
@@ -179,30 +180,31 @@ def _figures(groups: Sequence[Group]) -> Iterator[tuple[str, Figure]]:
 
 
 def _by_architecture(runs: Sequence[StoredRun]) -> Figure:
-    """The headline of every architecture: bars with intervals, or for many architectures dots without."""
+    """The headline of every architecture and method: a dot with its interval."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     metric = _headline(runs[0])
-    scale = 100 if metric.unit == "%" else 1
     names = list(runs[0].record.protocol.policies)
-    many = len(names) > BARS
+    many = len(names) > LEVEL_NAMES
     figure = Figure(figsize=(12 if many else 8, 4), layout="constrained")
     axes = figure.subplots()
-    width = 0.8 / len(runs)
+    step = 0.7 / len(runs)  # side by side, with a gap between architectures
     for number, run in enumerate(runs):
         found = run.record.results
         assert found is not None
-        there = [name for name in names if name in found.architectures]
-        of = [found.architectures[name][metric.column] for name in there]
-        places = [names.index(name) + (0 if many else (number - (len(runs) - 1) / 2) * width) for name in there]
-        heights = [each.value * scale for each in of]
-        if many:
-            axes.plot(places, heights, "o", markersize=4, label=run.record.method.label)
-        else:
-            around = [[(e.value - e.low) * scale for e in of], [(e.high - e.value) * scale for e in of]]
-            axes.bar(places, heights, width, yerr=around, capsize=2, label=run.record.method.label)
+        there = [(place, name) for place, name in enumerate(names) if name in found.architectures]
+        of = [found.architectures[name][metric.column] for _, name in there]
+        places = [place + (number - (len(runs) - 1) / 2) * step for place, _ in there]
+        values = [each.value * metric.scale for each in of]
+        around = [[(e.value - e.low) * metric.scale for e in of], [(e.high - e.value) * metric.scale for e in of]]
+        size, width = (2, 0.5) if many else (5, 1.5)
+        axes.errorbar(places, values, around, fmt="o", ms=size, elinewidth=width, label=run.record.method.label)
     axes.set_xticks(range(len(names)), names, rotation=90 if many else 30, fontsize=6 if many else 8)
-    _finish(figure, axes, runs[0], "")
+    axes.set_xlim(-0.5, len(names) - 0.5)
+    axes.set_xticks([place + 0.5 for place in range(len(names) - 1)], minor=True)
+    axes.tick_params(axis="x", which="minor", length=0)
+    axes.grid(axis="x", which="minor", color="0.9")
+    _finish(figure, axes, runs[0], "architecture; bars: 95 % intervals")
     return figure
 
 
@@ -211,39 +213,33 @@ def _top_curves(runs: Sequence[StoredRun]) -> Figure:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     metric = _headline(runs[0])
-    scale = 100 if metric.unit == "%" else 1
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
     for run in runs:
-        same, others = views.top_curve(run.episodes, run.record.protocol)
+        same, others = scores.top_curve(run.episodes, run.record.protocol)
         counts = range(1, len(same) + 1)
-        (line,) = axes.plot(counts, same * scale, label=run.record.method.label)
-        axes.plot(counts, others * scale, "--", color=line.get_color())
-    _finish(
-        figure, axes, runs[0], "best k policies; dashed: selected on half of the episodes, scored on the other half"
-    )
+        (line,) = axes.plot(counts, same * metric.scale, label=run.record.method.label)
+        axes.plot(counts, others * metric.scale, "--", color=line.get_color())
+    axes.plot([], [], "-", color="black", label="selected and scored\non the same episodes")
+    axes.plot([], [], "--", color="black", label="selected on half of\nthem, scored on the\nother half")
+    _finish(figure, axes, runs[0], "best k policies")
     return figure
 
 
 def _finish(figure: Figure, axes: Any, run: StoredRun, below: str) -> None:
-    protocol, metric = run.record.protocol, _headline(run)
+    """Title, axes and legend; the y axis reaches as far as the data."""
+    protocol = run.record.protocol
     axes.set_title(f"{protocol.task}, {protocol.split}")
-    axes.set_ylabel(f"{metric.label}{', %' if metric.unit else ''}")
+    axes.set_ylabel(_headline(run).heading)
     axes.set_xlabel(below)
-    if metric.unit == "%":
-        axes.set_ylim(0, 103)
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
     figure.legend(fontsize=8, loc="outside right upper")
 
 
-def _write(path: Path, content: str) -> None:
-    def write(temporary: Path) -> None:
-        temporary.write_text(content)
-
-    write_atomically(path, write)
-
-
-def _saver(figure: Figure) -> Callable[[Path], None]:
-    def save(temporary: Path) -> None:
-        figure.savefig(temporary, format="png", dpi=150, metadata={"Software": None})  # the same bytes every time
-
-    return save
+def _save(figure: Figure, path: Path) -> None:
+    write_atomically(
+        path,
+        # without a name of the software: the same bytes every time
+        lambda temporary: figure.savefig(temporary, format="png", dpi=150, metadata={"Software": None}),
+    )

@@ -11,51 +11,41 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from nnit_baselines import generator as generators
+from nnit_baselines import registry
 from nnit_baselines.generator import WEIGHTS, Generator, SampleRequest, check_batch
-from nnit_bench import novelty, records, views
+from nnit_bench import novelty, records, scores
+from nnit_bench.execution import Execution, Overwrite
 from nnit_bench.protocol import Protocol
+from nnit_bench.provenance import OUR_PACKAGES, numeric_packages, this_code
 from nnit_bench.records import Identity, Method, RunRecord, Timings, ZooVersion
+from nnit_bench.scores import Scores
 from nnit_bench.statistics import Estimate, Floats, Ints
-from nnit_bench.views import Scores
 from nnit_zoo.architecture import SPLITS, Architecture
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import MANIFEST, sha256_of
-from nnit_zoo.parallel import Backend
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.tasks.task import Task
 from nnit_zoo.zoo import Zoo
 
 Stage = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
 """Shows a stage of work: called with its name and size, gives a context that takes the number of newly done items."""
-Overwrite = Literal["never", "missing", "always"]
 UNITS = "units"
 """Folder in a run's folder that keeps finished work until the run is finished."""
 
 
 @dataclass(frozen=True)
-class Execution:
-    """How runs are carried out; none of this changes a number."""
-
-    output: Path
-    stage: Stage
-    workers: int = 2
-    parallel: Backend = "processes"
-    overwrite: Overwrite = "missing"
-
-
-@dataclass(frozen=True)
-class Contestant:
-    """A generator that is ready to sample, and how it got there."""
+class Entry:
+    """A method's entry in a run: a generator that is ready to sample, and how it got there."""
 
     method: Method
-    kind: type[Generator]
+    plugin: str | None
+    """The module that a method which is not one of ours comes from."""
     generator: Generator | None
     """None if it is of no use for what is asked."""
     unsupported: str | None
@@ -86,12 +76,15 @@ class ZooRow:
 
 
 def enter(
-    name: str, zoo: Zoo, protocol: Protocol, *, checkpoint: str | None = None, steps: int | None = None
-) -> Contestant:
-    """The contestant called `name`, with what identifies it; raises UserError if it cannot be loaded or fitted."""
+    name: str, zoo: Zoo, protocol: Protocol, *, checkpoint: str | None = None, sampling_steps: int | None = None
+) -> Entry:
+    """The entry of the method `name`, with what identifies it; raises UserError if it cannot be loaded or fitted."""
     start = time.perf_counter()
-    kind = generators.get(name)
-    given = {key: value for key, value in (("checkpoint", checkpoint), ("steps", steps)) if value is not None}
+    kind = registry.get(name)
+    ours = kind.__module__.partition(".")[0] in OUR_PACKAGES
+    plugin = None if ours else kind.__module__
+    options = {"checkpoint": checkpoint, "sampling_steps": sampling_steps}
+    given = {key: value for key, value in options.items() if value is not None}
     able = kind.capabilities
     reason = None
     if protocol.is_joint and not able.joint:
@@ -100,12 +93,12 @@ def enter(
         reason = f"the zoo has no policies of the split {protocol.split}"
     if reason:
         method = Method(name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None)
-        return Contestant(method, kind, None, reason, 0.0)
-    generator = generators.prepare(name, zoo, protocol.split, checkpoint, protocol.seed)
-    if steps is not None:
-        set_steps(name, generator, steps)
+        return Entry(method, plugin, None, reason, 0.0)
+    generator = registry.prepare(name, zoo, protocol.split, checkpoint, protocol.seed)
+    if sampling_steps is not None:
+        set_sampling_steps(name, generator, sampling_steps)
     method = describe(name, generator, given)
-    return Contestant(method, kind, generator, _lacks(generator, zoo, protocol), time.perf_counter() - start)
+    return Entry(method, plugin, generator, _lacks(generator, zoo, protocol), time.perf_counter() - start)
 
 
 def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
@@ -136,34 +129,29 @@ def _lacks(generator: Generator, zoo: Zoo, protocol: Protocol) -> str | None:
     return f"does not support {', '.join(lacking)}" if lacking else None
 
 
-def set_steps(name: str, generator: Generator, steps: int) -> None:
-    """Make the generator sample in this number of steps: such a one has `settings.sampling_steps`, a pydantic model's.
-
-    Raises UserError if it does not sample in steps.
-    """
-    settings: Any = getattr(generator, "settings", None)
-    if not hasattr(settings, "sampling_steps"):
-        raise UserError(f"{name} does not sample in steps: leave --steps out")
+def set_sampling_steps(name: str, generator: Generator, steps: int) -> None:
+    """Make the generator sample in this number of steps; raises UserError if it does not sample in steps."""
+    if generator.sampling_steps is None:
+        raise UserError(f"{name} does not sample in steps: leave --sampling-steps out")
     if steps < 1:
-        raise UserError(f"--steps must be 1 or more, not {steps}")
-    vars(generator)["settings"] = settings.model_copy(update={"sampling_steps": steps})
+        raise UserError(f"--sampling-steps must be 1 or more, not {steps}")
+    generator.sampling_steps = steps
 
 
-def run(task: Task, zoo: Zoo, entrant: Contestant, protocol: Protocol, execution: Execution) -> Outcome:
+def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execution, stage: Stage) -> Outcome:
     """Sample, score and record one method, or find that it has been done.
 
     An interrupted run leaves a record with status `started` and its finished work; the same call goes on from there.
     Raises UserError if the method or the task cannot, after recording that.
     """
-    ours = entrant.kind.__module__.partition(".")[0] in records.OUR_PACKAGES
-    code = records.this_code(None if ours else entrant.kind.__module__)
+    code = this_code(entry.plugin)
     sha256 = sha256_of(zoo.folder / MANIFEST)
     identity = Identity(
         protocol=protocol,
-        method=entrant.method,
+        method=entry.method,
         zoo_sha256=sha256,
         code_sha256=code.sha256,
-        packages=records.numeric_packages(),
+        packages=numeric_packages(),
     )
     folder = identity.folder(execution.output)
     if earlier := _earlier(folder, execution.overwrite):
@@ -172,10 +160,10 @@ def run(task: Task, zoo: Zoo, entrant: Contestant, protocol: Protocol, execution
     version = ZooVersion(sha256=sha256, policies=len(seen), seeds=len(pc.unique(seen["ghn_seed"])))
     record = RunRecord.start(identity, version, code)
     record.write(folder)
-    if entrant.unsupported:
-        return Outcome(record.stop(folder, "unsupported", entrant.unsupported), folder, reused=False, zeroed={})
+    if entry.unsupported:
+        return Outcome(record.stop(folder, "unsupported", entry.unsupported), folder, reused=False, zeroed={})
     try:
-        record = _carry_out(record, folder, task, zoo, entrant, execution)
+        record = _carry_out(record, folder, task, zoo, entry, execution, stage)
     except Exception as error:
         record.stop(folder, "failed", str(error) or type(error).__name__)
         raise
@@ -199,40 +187,40 @@ def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:
 
 
 def _carry_out(
-    record: RunRecord, folder: Path, task: Task, zoo: Zoo, entrant: Contestant, execution: Execution
+    record: RunRecord, folder: Path, task: Task, zoo: Zoo, entry: Entry, execution: Execution, stage: Stage
 ) -> RunRecord:
     """Sample, measure and score; returns the finished record."""
     protocol = record.protocol
     start = time.perf_counter()
-    batches = sample(task, entrant, protocol, execution.stage)
+    batches = sample(task, entry, protocol, stage)
     sampled = time.perf_counter()
     new, policies = novelty.measure(task, zoo, batches)
     compared = time.perf_counter()
-    episodes = score(task, batches, protocol, execution, folder / UNITS)
+    episodes = score(task, batches, protocol, execution, stage, folder / UNITS)
     scored = time.perf_counter()
     labels = {
-        "method": entrant.method.name,
-        "training_seed": entrant.method.training.get("seed"),
+        "method": entry.method.name,
+        "training_seed": entry.method.training.get("seed"),
         "sampling_seed": protocol.seed,
         "task": protocol.task,
         "task_version": protocol.task_version,
         "split": protocol.split,
     }
     for name, value in labels.items():
-        kind = records.EPISODE_SCHEMA.field(name).type
+        kind = records.STORED_EPISODE_SCHEMA.field(name).type
         episodes = episodes.append_column(name, pa.array([value] * len(episodes), kind))
-    episodes = episodes.select(records.EPISODE_SCHEMA.names)
+    episodes = episodes.select(records.STORED_EPISODE_SCHEMA.names)
     record = record.finish(
         folder,
         episodes,
         policies,
         timings=Timings(
-            load_or_fit=entrant.seconds,
+            load_or_fit=entry.seconds,
             sample=sampled - start,
             novelty=compared - sampled,
             score=scored - compared,
         ),
-        results=views.summarise(episodes, protocol),
+        results=scores.summarise(episodes, protocol),
         novelty=new,
     )
     shutil.rmtree(folder / UNITS, ignore_errors=True)
@@ -245,9 +233,9 @@ def zeroed(episodes: pa.Table) -> dict[str, int]:
     return dict(Counter(failed["reason"].to_pylist()))
 
 
-def sample(task: Task, entrant: Contestant, protocol: Protocol, stage: Stage) -> list[PolicyBatch]:
+def sample(task: Task, entry: Entry, protocol: Protocol, stage: Stage) -> list[PolicyBatch]:
     """The generated policies, one batch per architecture; raises UserError if the generator gives something else."""
-    name, generator = entrant.method.name, entrant.generator
+    name, generator = entry.method.name, entry.generator
     assert generator is not None
     batches = []
     with stage(f"{name}: sampling policies", sum(protocol.policies.values())) as advance:
@@ -275,13 +263,13 @@ def sample_seed(seed: int, architecture: str) -> int:
 
 
 def score(
-    task: Task, batches: Sequence[PolicyBatch], protocol: Protocol, execution: Execution, store: Path
+    task: Task, batches: Sequence[PolicyBatch], protocol: Protocol, execution: Execution, stage: Stage, store: Path
 ) -> pa.Table:
     """The episodes of all policies in phase `select`, then those of the best in phase `report`, if there is one."""
     policies = [policy for batch in batches for policy in batch]
 
     def phase(name: str, label: str, batches: Sequence[PolicyBatch], numbers: Ints, seeds: range) -> pa.Table:
-        with execution.stage(label, len(numbers) * len(seeds)) as advance:
+        with stage(label, len(numbers) * len(seeds)) as advance:
             table = task.evaluate(
                 batches,
                 seeds,
@@ -299,7 +287,7 @@ def score(
     select = phase("select", label, batches, np.arange(len(policies)), protocol.select.seeds)
     if protocol.report is None:
         return select
-    best = views.ranked(views.scores(select, protocol.metrics), protocol.metrics)[: protocol.top]
+    best = scores.ranked(scores.from_episodes(select, protocol.metrics), protocol.metrics)[: protocol.top]
     again, chosen = f"{protocol.task}: scoring the top {len(best)} again", [policies[number] for number in best]
     return pa.concat_tables([select, phase("report", again, chosen, best, protocol.report.seeds)])
 
@@ -319,5 +307,5 @@ def zoo_row(index: pa.Table, protocol: Protocol) -> ZooRow | None:
         each.column: rows[each.column].to_numpy().astype(np.float64)[:, None] for each in protocol.metrics
     }
     table = Scores(values, np.arange(len(rows)), np.array(rows["architecture"].to_pylist()), np.zeros(1, np.int64))
-    estimates, worst = views.of_means(table, protocol)
+    estimates, worst = scores.of_means(table, protocol)
     return ZooRow(estimates, worst, len(rows), int(pc.min(rows["episodes"]).as_py()))

@@ -42,6 +42,16 @@ class Estimate:
     low: float
     high: float
 
+    def text(self, scale: float = 1, *, signed: bool = False) -> tuple[str, str]:
+        """The value and its interval times `scale`, with one digit; a difference is `signed`.
+
+        The interval is empty if it has no width.
+        """
+        sign, between = ("+", " to ") if signed else ("", "-")
+        values = (f"{each * scale:{sign}.1f}" for each in (self.value, self.low, self.high))
+        value, low, high = (each.replace("100.0", "100") for each in values)  # four intervals fit 80 columns
+        return value, "" if self.low == self.high else f"{low}{between}{high}"
+
 
 def mean(
     values: Floats,

@@ -12,10 +12,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from nnit_bench.protocol import Metric, Protocol
+from nnit_bench.protocol import Protocol
 from nnit_bench.records import Distance, RunRecord
 from nnit_bench.runner import Outcome, ZooRow
 from nnit_bench.statistics import Estimate
+from nnit_zoo.tasks.metric import Metric
 
 STATISTICS = ("mean", "top", "top_heldout", "worst")
 
@@ -62,16 +63,6 @@ def plain(results: Results) -> dict[str, Any]:
     ]
     zoo = results.zoo and TypeAdapter(ZooRow).dump_python(results.zoo, mode="json")
     return {"protocol": results.protocol.model_dump(mode="json"), "runs": runs, "zoo": zoo}
-
-
-def number(estimate: Estimate | None, metric: Metric) -> tuple[str, str]:
-    """A value and its interval, if it has one, as text: shares as percentages, both with one digit."""
-    if estimate is None:
-        return "-", ""
-    scale = 100 if metric.unit == "%" else 1
-    values = (estimate.value, estimate.low, estimate.high)
-    value, low, high = (f"{each * scale:.1f}".replace("100.0", "100") for each in values)  # fits 80 columns
-    return value, "" if estimate.low == estimate.high else f"{low}-{high}"
 
 
 def _title(protocol: Protocol) -> str:
@@ -123,11 +114,11 @@ def _add(
     """Add the rows of one method, one per score."""
     for metric in metrics:
         first = metric is metrics[0]
-        cells = ["\n".join(number(estimates[metric.column].get(each), metric)).strip() for each in STATISTICS]
+        found = (estimates[metric.column].get(each) for each in STATISTICS)
+        cells = ["\n".join(each.text(metric.scale)).strip() if each else "-" for each in found]
         if first and worst:
             cells[-1] += f"\n{worst}"
-        unit = f", {metric.unit}" if metric.unit else ""
-        table.add_row(name if first else "", metric.label + unit, *cells)
+        table.add_row(name if first else "", metric.heading, *cells)
     table.add_section()
 
 

@@ -21,7 +21,7 @@ from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_atomically
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
-from nnit_zoo.build.ghn import GHN
+from nnit_zoo.ghn import GHN
 from nnit_zoo.parallel import in_chunks
 from nnit_zoo.sim.control import Controller
 from nnit_zoo.sim.rollout import rollout

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nnit_zoo.architecture import Architecture, architectures
 from nnit_zoo.atomic import write_atomically
-from nnit_zoo.build.ghn import GHN
+from nnit_zoo.ghn import GHN
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 

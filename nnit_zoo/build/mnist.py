@@ -1,4 +1,4 @@
-"""What building MNIST-PCA32's zoo needs besides the common stages: its features, and GHNs trained on labelled digits.
+"""Building MNIST-PCA32's zoo: its features, and GHNs trained on labelled digits.
 
 The paper is silent on how its GHNs were trained here. There is no expert: cross entropy on the training digits, over
 seen architectures drawn at random.
@@ -7,6 +7,9 @@ seen architectures drawn at random.
 from __future__ import annotations
 
 import gzip
+import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +19,14 @@ import torch
 from safetensors.numpy import save_file as save_arrays
 from torch import nn
 
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo.atomic import write_atomically, write_json
+from nnit_zoo.build.builder import Builder, log
 from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
-from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
-from nnit_zoo.tasks.mnist import MNISTPCA32
+from nnit_zoo.ghn import GHN
+from nnit_zoo.parallel import Backend
+from nnit_zoo.provenance import commit
+from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 
 PARTS = {"train": "train", "test": "t10k"}  # part -> how the names of its two original files begin
 SOURCES = "a folder with its four IDX files, or ylecun/mnist (needs nnit[datasets])"
@@ -140,3 +146,40 @@ def train_ghn(config: MNISTConfig, target: Path, seed: int) -> str:
     fit = Fit(ghn, config, seed, nn.functional.cross_entropy)
     loss = fit.run(observations, labels, config.steps, optimizer, schedule)
     return save_ghn(ghn, target, seed=seed, loss=loss)
+
+
+class MNISTBuilder(Builder):
+    """Fits the features to the training digits of `source`, and GHNs to the features."""
+
+    stages = ("features", "ghns", "scores", "pack")
+
+    def __init__(
+        self,
+        task: MNISTPCA32,
+        work: Path,
+        seeds: int,
+        workers: int,
+        parallel: Backend = "processes",
+        source: str | None = None,
+    ) -> None:
+        super().__init__(task, work, seeds, workers, parallel)
+        self.config = MNISTConfig()
+        self.source = source
+
+    def features(self) -> None:
+        """Make the features from the digits of `source`; without it, those that are there must do."""
+        target = self.data / "task.json"
+        if self.source is None:
+            if not target.exists():
+                raise UserError(f"{self.task.name} has no features yet: name with --source {SOURCES}")
+            log("features: done")
+            return
+        earlier = json.loads(target.read_text())["build"] if target.exists() else {}
+        constants, facts = build_features(self.source, self.data / FEATURES)
+        content = {"name": self.task.name, "version": self.task.version, **constants}
+        write_json(target, {**content, "build": {**earlier, "features": {**facts, "commit": str(commit())}}})
+        log(f"features: {json.dumps(facts)}")
+
+    def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
+        """Cross entropy on the training digits; there is no expert."""
+        return partial(train_ghn, self.config), {**self.config.model_dump(), "digits": 60_000}

@@ -7,7 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from nnit_zoo.files import HELDOUT_SEEDS_FROM
+from nnit_zoo.files import policy_split
 from nnit_zoo.tasks.task import Task
 
 POLICIES_PER_ARCHITECTURE = 100
@@ -28,7 +28,7 @@ SELECTION_SCHEMA = pa.schema(
 
 def is_yardstick(split: str, ghn_seed: int) -> bool:
     """Whether a policy of this split's architectures is for comparison only, and so never in the corpus."""
-    return split != "seen" or ghn_seed >= HELDOUT_SEEDS_FROM
+    return policy_split(split, ghn_seed) != "seen"
 
 
 def select(task: Task, split: str, architecture: str, scores: pa.Table) -> Iterator[dict[str, Any]]:

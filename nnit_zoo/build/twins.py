@@ -21,7 +21,7 @@ from nnit_zoo.atomic import write_atomically
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.distill import labelled
 from nnit_zoo.build.fit import Fit, FitConfig
-from nnit_zoo.build.ghn import GHN
+from nnit_zoo.ghn import GHN
 from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.tasks.robot import RobotPolicyTask
 

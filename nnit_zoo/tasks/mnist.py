@@ -16,8 +16,10 @@ from torch import Tensor
 
 from nnit_zoo.errors import UserError
 from nnit_zoo.parallel import Backend, unordered
+from nnit_zoo.places import data_folder
 from nnit_zoo.policy import PolicyBatch
-from nnit_zoo.tasks.task import Metric, Phase, Task, data_folder, episode_table
+from nnit_zoo.tasks.metric import Metric
+from nnit_zoo.tasks.task import Phase, Task, episode_table
 
 FEATURES = "features.safetensors"
 BLOCK = 100  # digits of an episode

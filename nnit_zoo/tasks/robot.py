@@ -23,7 +23,8 @@ from nnit_zoo.sim import stock
 from nnit_zoo.sim.control import Controller, padded_shape
 from nnit_zoo.sim.rollout import ACTIONS, Start, State, rollout
 from nnit_zoo.sim.tabletop import Array, require_simulator
-from nnit_zoo.tasks.task import Metric, Simulator, Task, episode_table
+from nnit_zoo.tasks.metric import Metric
+from nnit_zoo.tasks.task import Simulator, Task, episode_table
 
 # Episodes in lockstep, which are a unit of work. More of `fast` gain nothing and leave the cache; stock ManiSkill plays
 # one at a time on a CPU.

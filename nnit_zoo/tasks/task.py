@@ -6,7 +6,6 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -20,7 +19,9 @@ from torch import Tensor
 
 from nnit_zoo.errors import UserError
 from nnit_zoo.parallel import Backend
+from nnit_zoo.places import data_folder
 from nnit_zoo.policy import PolicyBatch
+from nnit_zoo.tasks.metric import Metric
 
 # A task without a notion of success, such as classification, leaves both success columns null.
 EPISODE_SCHEMA = pa.schema(
@@ -41,18 +42,6 @@ Simulator = Literal["fast", "stock", "stock-gpu"]
 _FIRST_SEEDS: dict[Phase, int] = {"select": 1_000_000_000, "report": 1_500_000_000}
 
 
-@dataclass(frozen=True)
-class Metric:
-    """A column of EPISODE_SCHEMA that a task fills, and how people read it.
-
-    `unit` is `%` for a share in [0, 1], and empty for a number that is shown as it is.
-    """
-
-    column: Literal["return", "success_once", "success_at_end"]
-    label: str
-    unit: Literal["%", ""]
-
-
 def episode_table(
     policies: Sequence[PolicyBatch], seeds: Sequence[int], scores: Mapping[str, npt.NDArray[Any]]
 ) -> pa.Table:
@@ -71,16 +60,11 @@ def episode_table(
     return pa.Table.from_arrays(arrays, schema=EPISODE_SCHEMA)
 
 
-def data_folder(task: str) -> Path:
-    """The folder of the package that holds what is shipped of a task."""
-    return Path(__file__).parents[1] / "data" / task
-
-
 class Task(ABC):
     """A problem that policies of fixed input and output sizes are scored on.
 
     Building a zoo and benchmark runs use disjoint episodes wherever a task has enough of them: seeds below a billion
-    belong to building. A plug-in, which ships no data in this package, overrides `record`.
+    belong to building.
     """
 
     name: ClassVar[str]

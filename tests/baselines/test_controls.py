@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nnit_baselines import generator as generators
+from nnit_baselines import registry
 from nnit_baselines.controls.resized import Crop, Nearest, resize
 from nnit_baselines.controls.stored import Noise006
 from nnit_baselines.generator import SampleRequest
@@ -12,11 +12,11 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView
 
-CONTROLS = sorted(set(generators.BUILT_IN) - {"nnit"})
+CONTROLS = sorted(set(registry.BUILT_IN) - {"nnit"})
 
 
 def fitted(name, view):
-    control = generators.get(name)()
+    control = registry.get(name)()
     control.fit(TrainingView(view.task, view.batches, reference=control.capabilities.oracle))
     return control
 
@@ -49,7 +49,7 @@ def test_a_control_gives_what_is_asked_and_repeats_itself(name, view):
 @pytest.mark.parametrize("name", [name for name in CONTROLS if name != "ghn-oracle"])
 def test_a_control_refuses_a_reference_view(name, view):
     with pytest.raises(UserError, match="never for training"):
-        generators.get(name)().fit(TrainingView(view.task, view.batches, reference=True))
+        registry.get(name)().fit(TrainingView(view.task, view.batches, reference=True))
 
 
 @pytest.mark.parametrize("name", ["zoo", "noise-0.03", "mean", "ghn-oracle"])

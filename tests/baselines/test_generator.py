@@ -6,20 +6,21 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nnit_baselines import generator as generators
+from nnit_baselines import Capabilities, Generator, registry
 from nnit_baselines.controls.resized import Crop
+from nnit_baselines.generator import WEIGHTS
 from nnit_zoo.errors import UserError
 
 PLUGIN = """
 import torch
-from nnit_baselines.generator import Capabilities, Generator
-from nnit_zoo.policy import PolicyBatch
+from nnit_baselines import Capabilities, Generator
+from nnit_zoo import PolicyBatch
 
 class Constant(Generator):
     capabilities = Capabilities()
     value = 1.0
 
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         self.task = view.task
 
     def sample(self, request):
@@ -47,7 +48,7 @@ class Undeclared(Constant):
 class Half(Generator):
     capabilities = Capabilities()
 
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         pass
 """
 
@@ -60,20 +61,20 @@ def plugin(tmp_path):
 
 
 def test_built_in_names_lead_to_classes():
-    assert {"nnit", "crop", "ghn-oracle"} <= set(generators.names())
-    assert all(issubclass(generators.get(name), generators.Generator) for name in generators.BUILT_IN)
+    assert {"nnit", "crop", "ghn-oracle"} <= set(registry.names())
+    assert all(issubclass(registry.get(name), Generator) for name in registry.BUILT_IN)
 
 
 def test_listing_names_imports_no_method():
     sys.modules.pop("nnit_baselines.controls.stored", None)
-    generators.names()
+    registry.names()
     assert "nnit_baselines.controls.stored" not in sys.modules
 
 
 def test_a_class_in_a_file_or_a_module_is_a_method(plugin, monkeypatch):
-    assert generators.get(f"{plugin}:Constant").__name__ == "Constant"
+    assert registry.get(f"{plugin}:Constant").__name__ == "Constant"
     monkeypatch.syspath_prepend(plugin.parent)
-    assert generators.get("plugin:Constant").__name__ == "Constant"
+    assert registry.get("plugin:Constant").__name__ == "Constant"
 
 
 @pytest.mark.parametrize("method", ["sub/one.py:Method", "beside:Method"])
@@ -86,12 +87,12 @@ def test_a_method_finds_the_modules_beside_it(method, tmp_path, monkeypatch):
         (folder / "beside.py").write_text(PLUGIN.replace("Constant", "Method"))
         monkeypatch.delitem(sys.modules, "beside", raising=False)
     (tmp_path / "sub" / "one.py").write_text("from beside import Method\n")
-    assert generators.get(method).__name__ == "Method"
+    assert registry.get(method).__name__ == "Method"
     monkeypatch.delitem(sys.modules, "beside")
 
 
 def test_a_method_may_be_a_torch_module_too(plugin, view, tmp_path):
-    kind = generators.get(f"{plugin}:Constant")
+    kind = registry.get(f"{plugin}:Constant")
 
     class Both(kind, torch.nn.Module):
         pass
@@ -103,7 +104,7 @@ def test_a_method_may_be_a_torch_module_too(plugin, view, tmp_path):
 
 
 def test_a_setting_cannot_take_the_place_of_ours(plugin, tmp_path, monkeypatch):
-    kind = generators.get(f"{plugin}:Constant")
+    kind = registry.get(f"{plugin}:Constant")
     monkeypatch.setattr(kind, "config", lambda self: {"value": 1.0, "training": {"lr": 0.1}})
     with pytest.raises(UserError, match="reserved key training"):
         kind().save_pretrained(tmp_path / "saved")
@@ -111,11 +112,11 @@ def test_a_setting_cannot_take_the_place_of_ours(plugin, tmp_path, monkeypatch):
 
 
 def test_a_method_without_a_checkpoint_is_fitted_with_the_runs_seed(plugin, view, monkeypatch):
-    kind, runs = generators.get(f"{plugin}:Constant"), []
-    monkeypatch.setattr(kind, "capabilities", generators.Capabilities(checkpoint=False))
-    monkeypatch.setattr(kind, "fit", lambda self, view, run=None: runs.append(run))
-    monkeypatch.setattr(generators, "get", lambda name: kind)
-    generators.prepare("constant", SimpleNamespace(task="Push", training_view=lambda: view), "unseen", seed=3)
+    kind, runs = registry.get(f"{plugin}:Constant"), []
+    monkeypatch.setattr(kind, "capabilities", Capabilities(checkpoint=False))
+    monkeypatch.setattr(kind, "fit", lambda self, view, options=None: runs.append(options))
+    monkeypatch.setattr(registry, "get", lambda name: kind)
+    registry.prepare("constant", SimpleNamespace(task="Push", training_view=lambda: view), "unseen", seed=3)
     assert [run.seed for run in runs] == [3]
 
 
@@ -125,8 +126,8 @@ def test_an_installed_entry_point_is_a_method(plugin, monkeypatch):
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
     (folder / "entry_points.txt").write_text("[nnit.generators]\nconstant = plugin:Constant\n")
     monkeypatch.syspath_prepend(plugin.parent)
-    assert "constant" in generators.names()
-    assert generators.get("constant").__name__ == "Constant"
+    assert "constant" in registry.names()
+    assert registry.get("constant").__name__ == "Constant"
 
 
 @pytest.mark.parametrize(
@@ -144,11 +145,11 @@ def test_an_installed_entry_point_is_a_method(plugin, monkeypatch):
 )
 def test_a_wrong_method_gets_an_answer(name, message, plugin):
     with pytest.raises(UserError, match=message):
-        generators.get(name.format(plugin=plugin))
+        registry.get(name.format(plugin=plugin))
 
 
 def test_a_checkpoint_comes_back_for_its_own_task_only(plugin, tmp_path):
-    kind = generators.get(f"{plugin}:Constant")
+    kind = registry.get(f"{plugin}:Constant")
     made = kind()
     made.task, made.value, made.training_facts = "Push", 2.5, {"steps": 3}
     made.save_pretrained(tmp_path / "saved")
@@ -160,15 +161,15 @@ def test_a_checkpoint_comes_back_for_its_own_task_only(plugin, tmp_path):
     with pytest.raises(UserError, match="is for Push, not for Pick"):
         kind.from_pretrained(tmp_path / "saved", "Pick")
     with pytest.raises(UserError, match="is of Constant, not of NNiT"):
-        generators.get("nnit").from_pretrained(tmp_path / "saved")
+        registry.get("nnit").from_pretrained(tmp_path / "saved")
 
 
 def test_a_missing_or_damaged_checkpoint_gets_an_answer(plugin, tmp_path):
-    kind = generators.get(f"{plugin}:Constant")
+    kind = registry.get(f"{plugin}:Constant")
     with pytest.raises(UserError, match="no checkpoint folder"):
         kind.from_pretrained(tmp_path / "nowhere")
     kind().save_pretrained(tmp_path / "saved")
-    (tmp_path / "saved" / generators.WEIGHTS).write_bytes(b"half a fi")
+    (tmp_path / "saved" / WEIGHTS).write_bytes(b"half a fi")
     with pytest.raises(UserError, match="cannot be read"):
         kind.from_pretrained(tmp_path / "saved")
 
@@ -176,12 +177,12 @@ def test_a_missing_or_damaged_checkpoint_gets_an_answer(plugin, tmp_path):
 def test_a_method_without_a_shipped_checkpoint_says_how_to_train_it(plugin):
     zoo = SimpleNamespace(task="Push")
     with pytest.raises(UserError, match=r"nnit-bench train --method .*Constant --task Push"):
-        generators.prepare(f"{plugin}:Constant", zoo, "unseen")
+        registry.prepare(f"{plugin}:Constant", zoo, "unseen")
 
 
 def test_a_control_is_fitted_on_the_training_view_and_an_oracle_on_the_reference(view):
     zoo = SimpleNamespace(task="Push", training_view=lambda: view, reference_view=lambda split: (split, view)[1])
-    assert generators.prepare("crop", zoo, "unseen").view is view
-    assert generators.prepare("ghn-oracle", zoo, "unseen").view is view
+    assert registry.prepare("crop", zoo, "unseen").view is view
+    assert registry.prepare("ghn-oracle", zoo, "unseen").view is view
     with pytest.raises(UserError, match="keeps no checkpoint"):
         Crop().save_pretrained("anywhere")

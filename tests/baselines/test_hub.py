@@ -1,23 +1,18 @@
 """Checkpoints on the Hub, against the local stand-in that the zoo's tests use."""
 
-import importlib.util
 import re
-from pathlib import Path
 
 import pytest
 import torch
 
+import stand_in_hub
 from nnit_baselines.generator import SampleRequest
 from nnit_baselines.nnit.config import NNiTConfig
 from nnit_baselines.nnit.generator import NNiT
 from nnit_zoo.errors import UserError
 
-spec = importlib.util.spec_from_file_location("zoo_conftest", Path(__file__).parents[1] / "zoo" / "conftest.py")
-stand_in = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(stand_in)
 
-
-class ModelHandler(stand_in.Handler):
+class ModelHandler(stand_in_hub.Handler):
     """The stand-in's data sets, at the addresses that models have."""
 
     def do_GET(self):
@@ -41,10 +36,10 @@ class ModelHandler(stand_in.Handler):
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    server = stand_in.Hub()
+    server = stand_in_hub.Hub()
     server.RequestHandlerClass = ModelHandler
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
-    with stand_in.serving(server, monkeypatch):
+    with stand_in_hub.serving(server, monkeypatch):
         yield server
 
 

@@ -8,13 +8,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nnit_baselines.generator import CHECKPOINTS, Run, SampleRequest
+from nnit_baselines import FitOptions, SampleRequest
 from nnit_baselines.nnit import training
 from nnit_baselines.nnit.config import PRESETS, NNiTConfig, preset
 from nnit_baselines.nnit.form import Form
 from nnit_baselines.nnit.generator import NNiT
 from nnit_baselines.nnit.mixture import Places
 from nnit_baselines.nnit.model import Transformer
+from nnit_baselines.registry import CHECKPOINTS
 from nnit_zoo.architecture import Architecture, architectures
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
@@ -158,7 +159,7 @@ def test_it_learns_to_sample_the_networks_it_was_shown(view, tmp_path):
     shown = TrainingView("Push", {architecture: view.batch(architecture)[:2]})
     settings = {"width": 48, "steps": 150, "batch": 8, "warmup": 20, "ema": 0.95, "sampling_steps": 10}
     generator = NNiT(PACKED.model_copy(update={**settings, "learning_rate": 3e-3}))
-    generator.fit(shown, Run(folder=tmp_path))
+    generator.fit(shown, FitOptions(folder=tmp_path))
     logged = json.loads((tmp_path / training.LOG).read_text().splitlines()[-1])["quality"]
     made, stored = generator.sample(SampleRequest(architecture, 16, 0)).flat(), shown.batch(architecture).flat()
     nearest = torch.cdist(made, stored).min(dim=1)
@@ -200,7 +201,7 @@ def test_it_learns_a_known_joint_distribution(settings, steps):
 def test_stopping_and_resuming_changes_nothing(settings, view, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "LOG_STEPS", 1)
     straight, resumed = NNiT(settings), NNiT(settings)
-    straight.fit(view, Run(seed=3))
+    straight.fit(view, FitOptions(seed=3))
 
     def stop(step, steps):
         if step == 4:
@@ -211,10 +212,10 @@ def test_stopping_and_resuming_changes_nothing(settings, view, tmp_path, monkeyp
     save = training.Trainer.save
     monkeypatch.setattr(training.Trainer, "save", lambda self, path: next(saves) or save(self, path))
     with pytest.raises(KeyboardInterrupt):
-        resumed.fit(view, Run(seed=3, folder=tmp_path, progress=stop))
+        resumed.fit(view, FitOptions(seed=3, folder=tmp_path, progress=stop))
     monkeypatch.setattr(training.Trainer, "save", save)
     tracked = []
-    resumed.fit(view, Run(seed=3, folder=tmp_path, track=tracked.append))
+    resumed.fit(view, FitOptions(seed=3, folder=tmp_path, track=tracked.append))
     assert all(torch.equal(value, resumed.tensors()[name]) for name, value in straight.tensors().items())
     lines = [json.loads(line) for line in (tmp_path / training.LOG).read_text().splitlines()]
     assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
@@ -224,11 +225,11 @@ def test_stopping_and_resuming_changes_nothing(settings, view, tmp_path, monkeyp
 
 def test_another_seed_gives_another_model_and_refuses_the_state(view, tmp_path):
     first, second = NNiT(PACKED), NNiT(PACKED)
-    first.fit(view, Run(seed=0, folder=tmp_path))
-    second.fit(view, Run(seed=1))
+    first.fit(view, FitOptions(seed=0, folder=tmp_path))
+    second.fit(view, FitOptions(seed=1))
     assert not torch.equal(first.tensors()["patch_in.weight"], second.tensors()["patch_in.weight"])
     with pytest.raises(UserError, match="other settings, seed or data"):
-        second.fit(view, Run(seed=1, folder=tmp_path))
+        second.fit(view, FitOptions(seed=1, folder=tmp_path))
 
 
 @pytest.mark.parametrize(("decay", "half"), [("linear", 6.5e-5), ("cosine", 6.5e-5)])
@@ -258,7 +259,7 @@ def test_training_in_bfloat16_gives_a_model(view):
 @BOTH
 def test_a_checkpoint_samples_the_same_networks(settings, view, tmp_path):
     generator, request = NNiT(settings), SampleRequest(view.architectures[1], 3, seed=5)
-    generator.fit(view, Run(steps=2))
+    generator.fit(view, FitOptions(steps=2))
     generator.save_pretrained(tmp_path)
     back = NNiT.from_pretrained(tmp_path, view.task)
     assert back.settings == generator.settings and back.capabilities == generator.capabilities
@@ -286,7 +287,7 @@ def test_it_samples_an_architecture_that_it_has_not_seen(settings, view):
 )
 def test_a_request_it_cannot_meet_gets_an_answer(architecture, message, view):
     generator = NNiT(PACKED)
-    generator.fit(view, Run(steps=1))
+    generator.fit(view, FitOptions(steps=1))
     assert architecture.inputs == 6 or not generator.supports(architecture)
     with pytest.raises(UserError, match=message):
         generator.sample(SampleRequest(architecture, 1, 0))
@@ -294,7 +295,7 @@ def test_a_request_it_cannot_meet_gets_an_answer(architecture, message, view):
 
 def test_without_joint_training_it_does_not_choose_architectures(view):
     generator = NNiT(PACKED.model_copy(update={"joint": False}))
-    generator.fit(view, Run(steps=1))
+    generator.fit(view, FitOptions(steps=1))
     assert not generator.capabilities.joint
     with pytest.raises(UserError, match="not trained to choose"):
         generator.sample_joint(3, 0)

@@ -1,6 +1,5 @@
 """A task that is scored by a formula, a generator that makes networks from its seed, and a small zoo: no simulator."""
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,21 +10,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from pydantic import BaseModel
-from safetensors.torch import save_file
 
-from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest
+from nnit_baselines import Capabilities, FitOptions, Generator, SampleRequest
 from nnit_bench import records
 from nnit_bench.protocol import Protocol
+from nnit_bench.provenance import Code
 from nnit_bench.records import Identity, Method, RunRecord, ZooVersion
 from nnit_bench.results import StoredRun
-from nnit_bench.views import summarise
+from nnit_bench.scores import summarise
+from nnit_zoo import ghn_file
 from nnit_zoo.architecture import Architecture, hidden_widths
-from nnit_zoo.build.ghn import GHN
-from nnit_zoo.files import INDEX_SCHEMA
+from nnit_zoo.files import GHNS, INDEX_SCHEMA
+from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import materialise, write_manifest
 from nnit_zoo.policy import PolicyBatch
-from nnit_zoo.tasks.task import EPISODE_SCHEMA, Metric, Task
+from nnit_zoo.tasks.metric import Metric
+from nnit_zoo.tasks.task import EPISODE_SCHEMA, Task
 from nnit_zoo.zoo import TrainingView, Zoo
 
 
@@ -95,10 +95,6 @@ class Digits(Formula):
         return table
 
 
-class Settings(BaseModel):
-    sampling_steps: int = 4
-
-
 class Seeded(Generator):
     """Networks whose first bias, their skill, is uniform in [0, 1] and follows from the request's seed alone."""
 
@@ -106,10 +102,10 @@ class Seeded(Generator):
 
     def __init__(self) -> None:
         super().__init__()
-        self.settings = Settings()
+        self.sampling_steps = 4
         self.training_facts = {"seed": 7, "seconds": 1}
 
-    def fit(self, view: TrainingView, run: Run | None = None) -> None:
+    def fit(self, view: TrainingView, options: FitOptions | None = None) -> None:
         pass
 
     def sample(self, request: SampleRequest) -> PolicyBatch:
@@ -129,7 +125,7 @@ class Seeded(Generator):
         ]
 
     def config(self) -> dict[str, Any]:
-        return self.settings.model_dump()
+        return {}
 
     def tensors(self) -> dict[str, torch.Tensor]:
         return {"weight": torch.ones(2)}
@@ -158,10 +154,8 @@ def protocol(task: Formula) -> Protocol:
 def embed_zoo(folder: Path, task: Task, seeds: Sequence[int], splits: dict[str, Sequence[str]]) -> Path:
     """A folder like a task's in the package: random hypernetworks, of which every policy is kept."""
     folder.mkdir(parents=True)
-    ghns = [GHN(task.inputs, task.outputs, seed).state_dict() for seed in seeds]
-    stacked = {name: torch.stack([ghn[name] for ghn in ghns]).half().contiguous() for name in ghns[0]}
-    metadata = {"task": task.name, "inputs": task.inputs, "outputs": task.outputs, "ghn_seeds": list(seeds)}
-    save_file(stacked, folder / "ghns.safetensors", {"nnit": json.dumps(metadata)})
+    states = {seed: GHN(task.inputs, task.outputs, seed).state_dict() for seed in seeds}
+    ghn_file.write(folder / GHNS, ghn_file.GHNs(task.name, task.inputs, task.outputs, states))
     scores = {"success_once": 1.0, "success_at_end": 0.9, "return": 36.0, "episodes": 64, "kept": True}
     rows = [
         {"architecture": name, "ghn_seed": seed, "split": split, **scores}
@@ -215,11 +209,11 @@ def plugin(tmp_path: Path) -> Path:
     path = tmp_path / "my_method.py"
     path.write_text(
         "import torch\n"
-        "from nnit_baselines.generator import Capabilities, Generator\n"
-        "from nnit_zoo.policy import PolicyBatch\n\n\n"
+        "from nnit_baselines import Capabilities, Generator\n"
+        "from nnit_zoo import PolicyBatch\n\n\n"
         "class Zeros(Generator):\n"
         "    capabilities = Capabilities(checkpoint=False)\n\n"
-        "    def fit(self, view, run=None):\n"
+        "    def fit(self, view, options=None):\n"
         "        self.task = view.task\n\n"
         "    def sample(self, request):\n"
         "        shapes = request.architecture.block_shapes\n"
@@ -235,15 +229,15 @@ def store_run(folder: Path, name: str, protocol: Protocol, success: np.ndarray) 
     names = ["16-16-16-32" if protocol.is_joint else each for each in names]
     rows = []
     for (policy, column), value in np.ndenumerate(success):
-        row = dict.fromkeys(records.EPISODE_SCHEMA.names) | {"policy": policy, "phase": "select"}
+        row = dict.fromkeys(records.STORED_EPISODE_SCHEMA.names) | {"policy": policy, "phase": "select"}
         row |= {"architecture": names[policy], "episode_seed": protocol.select.first + column}
         if "success_at_end" in [metric.column for metric in protocol.metrics]:
             row |= {"success_at_end": bool(value), "success_once": bool(value), "return": 40.0 * value}
         rows.append({"return": value} | {name: each for name, each in row.items() if each is not None})
-    episodes = pa.Table.from_pylist(rows, records.EPISODE_SCHEMA)
+    episodes = pa.Table.from_pylist(rows, records.STORED_EPISODE_SCHEMA)
     method = Method(name=name, config={}, given={}, training={}, parameters=None, checkpoint_sha256=None)
     identity = Identity(protocol=protocol, method=method, zoo_sha256="z", code_sha256="c", packages={})
-    code = records.Code(sha256="c", commit=None, dirty=None)
+    code = Code(sha256="c", commit=None, dirty=None)
     place = identity.folder(folder)
     record = RunRecord.start(identity, ZooVersion(sha256="z", policies=1, seeds=1), code)
     timings = records.Timings(load_or_fit=0, sample=0, novelty=0, score=0)

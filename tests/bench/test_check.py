@@ -5,7 +5,8 @@ import json
 import pytest
 import torch
 
-from nnit_baselines.generator import BUILT_IN, Capabilities, Generator, get, refuse_reference
+from nnit_baselines import Capabilities, Generator, get, refuse_reference
+from nnit_baselines.registry import BUILT_IN
 from nnit_bench import check
 from nnit_bench.check import SEEN, examine, synthetic_view
 from nnit_zoo.architecture import Architecture, hidden_widths
@@ -19,7 +20,7 @@ class Good(Generator):
     capabilities = Capabilities(joint=True, widths=(16, 32, 64), depths=(4,))
     scale = 1.0
 
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         refuse_reference(view)
         self.task = view.task
         self.known = view.architectures
@@ -105,17 +106,17 @@ class DoesNothing(Good):
 
 
 class LearnsYardsticks(Good):
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         self.task, self.known = view.task, view.architectures
 
 
 class ForgetsTask(Good):
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         refuse_reference(view)
 
 
 class FailsToFit(Good):
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         refuse_reference(view)
         return {}["missing"]
 
@@ -176,13 +177,13 @@ class ClaimsDeterministic(Good):
 
 
 class SeedsGlobally(Good):
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         super().fit(view)
         torch.manual_seed(0)
 
 
 class ScalesTheZoo(Good):
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         super().fit(view)
         view.batches[view.architectures[0]].layers[0].mul_(2)
 
@@ -235,7 +236,7 @@ class OtherTask(Good):
 
 
 class ForgetsItsLimits(Good):
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         super().fit(view)
         self.capabilities = Capabilities(joint=True, widths=(16, 32, 64), depths=(4,), deterministic=False)
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from nnit_bench import cli
-from nnit_zoo import files, tasks
+from nnit_zoo import places, tasks
 from nnit_zoo.architecture import hidden_widths
 from nnit_zoo.errors import UserError
 
@@ -39,8 +39,8 @@ def fresh(task: Any, embed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     """A machine with nnit and a task's embedded zoo, and nothing downloaded yet; gives the folder for results."""
     embedded = tmp_path / "embedded" / task.name
     embed(embedded, task, [0, 1], {"seen": ["64-64-64-64"], "unseen": hidden_widths("unseen")})
-    monkeypatch.setattr(files, "EMBEDDED", embedded.parent)
-    monkeypatch.setattr(files, "default_folder", lambda name: tmp_path / "cache" / name)
+    monkeypatch.setattr(places, "DATA", embedded.parent)
+    monkeypatch.setattr(places, "default_folder", lambda name: tmp_path / "cache" / name)
     get = tasks.get
     monkeypatch.setattr(tasks, "get", lambda name: task if name == task.name else get(name))
     return tmp_path / "results"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nnit_bench import compare
-from nnit_bench.protocol import Episodes, Protocol
+from nnit_bench.protocol import Protocol, SeedRange
 from nnit_bench.results import StoredRun
 from nnit_zoo.errors import UserError
 
@@ -57,12 +57,12 @@ def test_a_run_against_itself_is_no_different_at_all(store: Store, protocol: Pro
 def test_only_shared_architectures_and_episodes_count(store: Store, protocol: Protocol) -> None:
     everything = outcomes(0.2, 1)
     whole = store("whole", protocol, everything)
-    later = protocol.model_copy(update={"select": Episodes(first=protocol.select.first + 5, count=15)})
+    later = protocol.model_copy(update={"select": SeedRange(first=protocol.select.first + 5, count=15)})
     part = store("part", later, everything[:40, 5:])
     mean = compare.differ(whole, part)[0]
     assert (mean.first, mean.second) == (everything[:40, 5:].mean(), everything[:40, 5:].mean())
     assert mean.difference.value == 0
-    apart = protocol.model_copy(update={"select": Episodes(first=protocol.select.first + 50, count=20)})
+    apart = protocol.model_copy(update={"select": SeedRange(first=protocol.select.first + 50, count=20)})
     with pytest.raises(UserError, match="no episode in common"):
         compare.differ(whole, store("apart", apart, everything))
 

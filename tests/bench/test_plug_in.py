@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import nnit_bench.cli
-from nnit_baselines import generator
+from nnit_baselines import registry
 from nnit_bench.check import examine, synthetic_view
 from nnit_zoo.errors import UserError
 
@@ -46,7 +46,7 @@ def test_the_example_in_the_docs_is_short_and_keeps_the_contract(tmp_path):
     assert len(example.splitlines()) < 60
     path = tmp_path / "my_method.py"
     path.write_text(example)
-    assert [verdict.problem for verdict in examine(generator.get(f"{path}:Gaussian")) if verdict.problem] == []
+    assert [verdict.problem for verdict in examine(registry.get(f"{path}:Gaussian")) if verdict.problem] == []
 
 
 def test_the_example_is_the_package_that_is_installed_here():
@@ -62,29 +62,27 @@ def test_shell_command_parses(command):
 
 
 def test_an_installed_package_offers_its_method_by_name(installed):
-    assert "gaussian" in generator.names()
-    kind = generator.get("gaussian")
+    assert "gaussian" in registry.names()
+    kind = registry.get("gaussian")
     assert Path(sys.modules[kind.__module__].__file__).is_relative_to(installed)
     made = kind()
     made.fit(synthetic_view())
     made.save_pretrained(installed / "checkpoint")
     assert kind.from_pretrained(installed / "checkpoint").task == made.task
     with pytest.raises(UserError, match="did you mean gaussian"):
-        generator.get("gausian")
+        registry.get("gausian")
 
 
 def test_a_broken_package_warns_and_stops_no_other(installed):
     with pytest.warns(UserWarning, match="method broken is left out: .*ValueError: half-written") as caught:
-        available = generator.available()
-    assert (
-        len(caught) == 1 and {"gaussian", "nnit", *generator.BUILT_IN} <= set(available) and "broken" not in available
-    )
+        available = registry.available()
+    assert len(caught) == 1 and {"gaussian", "nnit", *registry.BUILT_IN} <= set(available) and "broken" not in available
     assert available["crop"].__module__ == "nnit_baselines.controls.resized"  # the built-in one keeps its name
     with pytest.raises(UserError, match="cannot load method"):
-        generator.get("broken")
+        registry.get("broken")
 
 
 def test_without_the_package_there_is_no_such_method():
     assert "nnit-gaussian" not in {each.metadata["Name"] for each in metadata.distributions()}
     with pytest.raises(UserError, match="no method named 'gaussian'"):
-        generator.get("gaussian")
+        registry.get("gaussian")

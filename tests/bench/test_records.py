@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import nnit_bench
-from nnit_bench import novelty, records, views
+from nnit_bench import novelty, records, scores
 from nnit_bench.records import RunRecord
 from nnit_zoo.errors import UserError
 
@@ -33,9 +33,9 @@ def test_a_run_of_an_earlier_version_loads(folder: Path) -> None:
         assert record.error and record.results is None
         return
     episodes = records.read_episodes(folder)
-    assert episodes.schema.equals(records.EPISODE_SCHEMA)
+    assert episodes.schema.equals(records.STORED_EPISODE_SCHEMA)
     assert pq.ParquetFile(folder / records.POLICIES).schema_arrow.equals(novelty.SCHEMA)
-    again = views.summarise(episodes, record.protocol)
+    again = scores.summarise(episodes, record.protocol)
     assert record.results is not None and again.joint == record.results.joint
     for column, statistics in record.results.estimates.items():
         for name, stored in statistics.items():
@@ -60,10 +60,13 @@ def test_the_number_of_workers_is_no_part_of_a_run() -> None:
     record = RunRecord.read(GOLDEN[0])
     settings = {"protocol": record.protocol, "zoo_sha256": "z", "code_sha256": "c", "packages": {}}
     first = records.Identity(method=record.method, **settings)
-    elsewhere = record.method.model_copy(update={"given": {"checkpoint": "x"}, "training": {"seconds": 1}})
+    elsewhere = record.method.model_copy(
+        update={"given": record.method.given | {"checkpoint": "x"}, "training": {"seconds": 1}}
+    )
     assert records.Identity(method=elsewhere, **settings).run_id == first.run_id
-    other = record.method.model_copy(update={"checkpoint_sha256": "x"})
-    assert records.Identity(method=other, **settings).run_id != first.run_id
+    for change in ({"checkpoint_sha256": "x"}, {"given": {"sampling_steps": 9}}):
+        other = record.method.model_copy(update=change)
+        assert records.Identity(method=other, **settings).run_id != first.run_id
     assert "workers" not in first.model_dump_json()
 
 

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from nnit_bench import paper, results
-from nnit_bench.protocol import Episodes, Metric, Protocol
+from nnit_bench.protocol import Protocol, SeedRange
 from nnit_bench.report import report
 from nnit_bench.results import StoredRun
 from nnit_zoo.errors import UserError
+from nnit_zoo.tasks.metric import Metric
 
 from .conftest import store_run
 
@@ -79,7 +80,7 @@ def test_shipped_runs_are_marked_and_give_way_to_newer_ones(
     shutil.copytree(shipped / place, mine / place)  # the very same run
     assert chosen() == mine / place
     shutil.rmtree(mine / place)
-    quick = pick.model_copy(update={"select": Episodes(first=pick.select.first, count=5)})
+    quick = pick.model_copy(update={"select": SeedRange(first=pick.select.first, count=5)})
     store_run(mine, "nnit", quick, outcomes(0.9, 80)[:, :5])
     assert chosen() == shipped / place
     again = store_run(mine, "nnit", pick.model_copy(update={"seed": 1}), outcomes(0.8, 80))

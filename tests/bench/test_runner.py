@@ -11,7 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from nnit_bench import records, runner, views
+from nnit_baselines.controls.resized import Crop
+from nnit_bench import records, runner, scores
+from nnit_bench.execution import Execution
 from nnit_bench.protocol import Protocol
 from nnit_bench.records import RunRecord
 from nnit_zoo.architecture import Architecture
@@ -24,21 +26,21 @@ def silent(label: str, total: int) -> Any:
     return nullcontext(lambda done: None)
 
 
-def contestant(generator: Any) -> runner.Contestant:
-    return runner.Contestant(runner.describe("seeded", generator, {}), type(generator), generator, None, 0.0)
+def entry_of(generator: Any, **given: Any) -> runner.Entry:
+    return runner.Entry(runner.describe("seeded", generator, given), type(generator).__module__, generator, None, 0.0)
 
 
 @pytest.fixture
-def execution(tmp_path: Path) -> runner.Execution:
-    return runner.Execution(output=tmp_path, stage=silent, workers=1)
+def execution(tmp_path: Path) -> Execution:
+    return Execution(output=tmp_path, workers=1)
 
 
 @pytest.fixture
-def run(task: Any, generator: Any, protocol: Protocol, zoo: Any, execution: runner.Execution) -> Run:
+def run(task: Any, generator: Any, protocol: Protocol, zoo: Any, execution: Execution) -> Run:
     def run_it(**changes: Any) -> runner.Outcome:
-        given = {"task": task, "zoo": zoo, "entrant": contestant(generator), "protocol": protocol} | changes
+        given = {"task": task, "zoo": zoo, "entry": entry_of(generator), "protocol": protocol} | changes
         how = replace(execution, **{"overwrite": given.pop("overwrite", "missing")})
-        return runner.run(**given, execution=how)
+        return runner.run(**given, execution=how, stage=silent)
 
     return run_it
 
@@ -46,13 +48,13 @@ def run(task: Any, generator: Any, protocol: Protocol, zoo: Any, execution: runn
 def test_every_episode_is_on_record_and_gives_back_the_results(run: Run, task: Any, protocol: Protocol) -> None:
     outcome = run()
     episodes = records.read_episodes(outcome.folder)
-    assert episodes.schema.equals(records.EPISODE_SCHEMA)
+    assert episodes.schema.equals(records.STORED_EPISODE_SCHEMA)
     assert episodes.num_rows == 8 * 3 * 6 + 4 * 6
     assert protocol.report is not None
     assert task.calls == [(24, list(protocol.select.seeds)), (4, list(protocol.report.seeds))]
     record = RunRecord.read(outcome.folder)
     assert record == outcome.record and record.status == "success" and record.protocol == protocol
-    assert views.summarise(episodes, protocol) == record.results
+    assert scores.summarise(episodes, protocol) == record.results
     first = episodes.to_pylist()[0]
     assert (first["method"], first["training_seed"], first["task_version"]) == ("seeded", 7, 1)
     policies = pq.ParquetFile(outcome.folder / records.POLICIES).read()
@@ -81,12 +83,12 @@ def test_the_best_are_scored_again_under_their_own_numbers(run: Run) -> None:
 
 
 def test_an_architectures_policies_do_not_depend_on_the_others(task: Any, generator: Any, protocol: Protocol) -> None:
-    entrant = contestant(generator)
+    entry = entry_of(generator)
     alone = protocol.model_copy(update={"policies": {"64-64-64-16": 3}})
-    everything = {str(batch.architecture): batch for batch in runner.sample(task, entrant, protocol, silent)}
-    (one,) = runner.sample(task, entrant, alone, silent)
+    everything = {str(batch.architecture): batch for batch in runner.sample(task, entry, protocol, silent)}
+    (one,) = runner.sample(task, entry, alone, silent)
     assert one.flat().equal(everything["64-64-64-16"].flat())
-    reseeded = runner.sample(task, entrant, alone.model_copy(update={"seed": 1}), silent)
+    reseeded = runner.sample(task, entry, alone.model_copy(update={"seed": 1}), silent)
     assert not one.flat().equal(reseeded[0].flat())
 
 
@@ -113,9 +115,9 @@ def test_what_a_method_cannot_is_unsupported_and_not_zero(run: Run, task: Any, z
     assert lacking == "supports no architecture of the split deep"
     mixed = deep.model_copy(update={"policies": {"32-32-32-32": 1, "32-32": 1}})
     assert runner._lacks(generator, zoo, mixed) == "does not support 32-32"
-    outcome = run(protocol=deep, entrant=replace(contestant(generator), unsupported=lacking))
+    outcome = run(protocol=deep, entry=replace(entry_of(generator), unsupported=lacking))
     assert outcome.record.status == "unsupported" and outcome.record.results is None
-    assert run(protocol=deep, entrant=replace(contestant(generator), unsupported=lacking)).reused
+    assert run(protocol=deep, entry=replace(entry_of(generator), unsupported=lacking)).reused
     joint = runner.enter("crop", zoo, Protocol.of(task, "joint"))
     assert joint.unsupported == "does not choose architectures"
     oracle = runner.enter("ghn-oracle", zoo, Protocol.of(task, "wide"))
@@ -128,8 +130,9 @@ def test_an_identical_run_is_found_again_and_no_other(run: Run, protocol: Protoc
     assert found.reused and found.record == first.record
     assert not run(protocol=protocol.model_copy(update={"seed": 1})).reused
     assert not run(overwrite="always").reused
-    runner.set_steps("seeded", generator, 9)
-    assert not run(entrant=contestant(generator)).reused
+    runner.set_sampling_steps("seeded", generator, 9)
+    nine = entry_of(generator, sampling_steps=9)
+    assert not run(entry=nine).reused and run(entry=nine).reused
 
 
 def test_an_interrupted_run_keeps_its_work_and_is_finished(
@@ -202,9 +205,9 @@ def test_a_damaged_record_is_told(run: Run) -> None:
 
 def test_steps_of_a_method_without_steps(generator: Any) -> None:
     with pytest.raises(UserError, match="does not sample in steps"):
-        runner.set_steps("thing", object(), 5)  # type: ignore[arg-type]
+        runner.set_sampling_steps("crop", Crop(), 5)
     with pytest.raises(UserError, match="1 or more"):
-        runner.set_steps("seeded", generator, 0)
+        runner.set_sampling_steps("seeded", generator, 0)
 
 
 def test_the_zoos_row_holds_the_same_architectures_only(zoo_index: pa.Table, protocol: Protocol) -> None:

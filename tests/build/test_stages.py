@@ -14,21 +14,21 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from nnit_zoo import stats, tasks
+from nnit_zoo import files, places, stats, tasks
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.build import distill, expert, mnist, selection, stages, twins
+from nnit_zoo.build import builder as common
+from nnit_zoo.build import distill, expert, mnist, robot, stages, twins
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.fit import Fit
-from nnit_zoo.build.ghn import GHN
 from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.cli import main
 from nnit_zoo.errors import UserError
+from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import materialise
-from nnit_zoo.tasks import task as task_module
-from nnit_zoo.tasks.mnist import MNISTPCA32
+from nnit_zoo.places import data_folder
+from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
-from nnit_zoo.tasks.task import data_folder
 from nnit_zoo.verify import rescore
 from nnit_zoo.zoo import Zoo
 
@@ -42,25 +42,26 @@ FEW = {"seen": ("16-32-64-16", "64-64-64-64"), "unseen": ("16-16-16-32",), "excl
 
 @pytest.fixture
 def builder(monkeypatch):
-    """A function that makes a toy builder whose package data go to a folder of the test's."""
+    """A function that makes a toy builder whose data folder is in a folder of the test's."""
     torch.set_num_threads(1)  # as `build` does; bits depend on it
     monkeypatch.setattr(expert, "EVALUATION_SEEDS", range(2))
     monkeypatch.setattr(PickCube, "scoring_seeds", range(2))
-    monkeypatch.setattr(stages, "architectures", few_architectures)
+    monkeypatch.setattr(common, "architectures", few_architectures)
+    shipped = data_folder("MNIST-PCA32")
     forget = tasks.get.cache_clear
 
-    def make(folder, task="PickCube-v1"):
-        monkeypatch.setattr(stages, "data_folder", lambda name: folder / "data")
-        monkeypatch.setattr(task_module, "data_folder", lambda name: folder / "data")
+    def make(folder, task="PickCube-v1", source=None):
+        monkeypatch.setattr(places, "DATA", folder / "data")
         forget()  # a task keeps the record that it has read
         if task == "MNIST-PCA32":
-            (folder / "data").mkdir(parents=True, exist_ok=True)
-            if not (folder / "data" / "task.json").exists():
-                shutil.copy(data_folder(task) / "task.json", folder / "data")
-            built = stages.MNISTBuilder(MNISTPCA32(), folder / "work", seeds=2, workers=1)
+            if not data_folder(task).exists():
+                data_folder(task).mkdir(parents=True)
+                for name in ("task.json", FEATURES):
+                    shutil.copy(shipped / name, data_folder(task))
+            built = mnist.MNISTBuilder(MNISTPCA32(), folder / "work", seeds=2, workers=1, source=source)
             built.config = TINY_FIT
         else:
-            built = stages.RobotBuilder(PickCube(), folder / "work", seeds=2, workers=1)
+            built = robot.RobotBuilder(PickCube(), folder / "work", seeds=2, workers=1)
             built.expert_config, built.distill_config = TINY_EXPERT, TINY_DISTILL
         return built
 
@@ -78,7 +79,8 @@ def run_all(builder):
 
 
 def artifacts(folder):
-    return {path.name: path.read_bytes() for path in (folder / "data").iterdir() if path.name != "task.json"}
+    given = ("task.json", FEATURES)
+    return {path.name: path.read_bytes() for path in folder.glob("data/*/*") if path.name not in given}
 
 
 def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder, tmp_path, monkeypatch):
@@ -98,7 +100,7 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
         (Fit, "run"),
         (distill, "train_ghn"),
         (PickCube, "evaluate"),
-        (stages, "write_manifest"),
+        (common, "write_manifest"),
     ):
         with monkeypatch.context() as killing:
             kill_second_call(killing, module, name)
@@ -108,14 +110,14 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
     run_all(builder(tmp_path / "killed"))
     assert artifacts(tmp_path / "killed") == whole
 
-    materialise(tmp_path / "killed" / "data", tmp_path / "zoo")
+    materialise(data_folder("PickCube-v1"), tmp_path / "zoo")
     zoo = Zoo.open(tmp_path / "zoo")
     assert {split: len(zoo.architectures(split)) for split in ("seen", "unseen", "excluded")} == {
         "seen": 0,  # nothing passes after so little training
         "unseen": 1,
         "excluded": 1,
     }
-    record = json.loads((tmp_path / "killed" / "data" / "task.json").read_text())
+    record = json.loads((data_folder("PickCube-v1") / "task.json").read_text())
     assert record["build"]["expert"]["config"]["hidden"] == 16
     assert record["build"]["ghns"]["states"] == 2 * 2 * 50
 
@@ -130,7 +132,7 @@ def test_a_killed_build_of_mnist_ends_with_the_same_bytes_and_a_zoo_with_accurac
         "scores.parquet",
         "selection.parquet",
     }
-    for module, name in ((mnist, "train_ghn"), (MNISTPCA32, "evaluate"), (stages, "write_manifest")):
+    for module, name in ((mnist, "train_ghn"), (MNISTPCA32, "evaluate"), (common, "write_manifest")):
         with monkeypatch.context() as killing:
             kill_second_call(killing, module, name)
             with pytest.raises(KeyboardInterrupt):
@@ -139,14 +141,14 @@ def test_a_killed_build_of_mnist_ends_with_the_same_bytes_and_a_zoo_with_accurac
     run_all(builder(tmp_path / "killed", "MNIST-PCA32"))
     assert artifacts(tmp_path / "killed") == whole
 
-    materialise(tmp_path / "whole" / "data", tmp_path / "zoo")
+    materialise(data_folder("MNIST-PCA32"), tmp_path / "zoo")
     zoo = Zoo.open(tmp_path / "zoo")
     assert len(zoo) == 4  # of the unseen and the excluded architecture; seen ones pass only when they are trained
     row = zoo.index.to_pylist()[0]
     assert row["success_at_end"] is None and row["episodes"] == 100
     table = MNISTPCA32().evaluate([zoo.batch(row["architecture"], row["split"])[0]], range(100))
     assert row["return"] == pytest.approx(np.mean(table["return"].to_numpy()))
-    record = json.loads((tmp_path / "whole" / "data" / "task.json").read_text())
+    record = json.loads((data_folder("MNIST-PCA32") / "task.json").read_text())
     assert record["build"]["ghns"]["steps"] == 3 and record["build"]["features"]["train"] == 60_000
 
 
@@ -168,9 +170,8 @@ def test_networks_for_digits_are_scored_where_the_user_says(builder, tmp_path, m
 
 def test_features_are_made_from_the_named_source_and_keep_the_record_of_the_zoo(builder, tmp_path):
     sample = Path(__file__).parents[1] / "zoo" / "mnist"
-    built = builder(tmp_path, "MNIST-PCA32")
-    built.source = str(sample)
-    task_json = tmp_path / "data" / "task.json"
+    built = builder(tmp_path, "MNIST-PCA32", source=str(sample))
+    task_json = data_folder("MNIST-PCA32") / "task.json"
     earlier = json.loads(task_json.read_text())
     earlier["build"]["ghns"] = {"steps": 3}
     task_json.write_text(json.dumps(earlier))
@@ -179,9 +180,8 @@ def test_features_are_made_from_the_named_source_and_keep_the_record_of_the_zoo(
     assert record["build"]["features"]["train"] == 16 and record["build"]["ghns"] == {"steps": 3}
     assert len(set(record["observation_std"])) == 1 and record["observation_std"] != earlier["observation_std"]
     task_json.unlink()
-    built.source = None
     with pytest.raises(UserError, match="--source a folder with its four IDX files"):
-        built.features()
+        builder(tmp_path, "MNIST-PCA32").features()
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_twins_learn_the_same_from_seeds_of_their_own_and_go_on_after_a_kill(bui
             with pytest.raises(KeyboardInterrupt):
                 prepare(tmp_path / "killed").twins()
     prepare(tmp_path / "killed").twins()
-    made = [(tmp_path / name / "data" / "twins.json").read_bytes() for name in ("whole", "killed")]
+    made = [(tmp_path / name / "data" / "PickCube-v1" / "twins.json").read_bytes() for name in ("whole", "killed")]
     assert made[0] == made[1]
     content = json.loads(made[0])
     assert content["config"]["networks"] == 2 and content["episodes"] == 2
@@ -260,11 +260,11 @@ def test_a_wide_canvas_is_made_by_more_blocks_and_fills_wide_layers():
 
 
 def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_path, monkeypatch):
-    monkeypatch.setattr(selection, "HELDOUT_SEEDS_FROM", 1)
-    monkeypatch.setattr(stages.RobotBuilder, "yardstick_episodes", 1)
+    monkeypatch.setattr(files, "HELDOUT_SEEDS_FROM", 1)
+    monkeypatch.setattr(robot.RobotBuilder, "yardstick_episodes", 1)
     built = builder(tmp_path)
     run_all(built)
-    rows = pq.read_table(tmp_path / "data" / "selection.parquet").to_pylist()
+    rows = pq.read_table(data_folder("PickCube-v1") / "selection.parquet").to_pylist()
     played = {(row["architecture"], row["ghn_seed"]): row["episodes"] for row in rows}
     assert played == {
         (architecture, seed): 2 if split == "seen" and seed == 0 else 1
@@ -272,7 +272,7 @@ def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_
         for architecture in listed
         for seed in (0, 1)
     }
-    scores = pq.read_table(tmp_path / "data" / "scores.parquet").to_pylist()
+    scores = pq.read_table(data_folder("PickCube-v1") / "scores.parquet").to_pylist()
     first = [(row["ghn_seed"], row["seed"]) for row in scores if row["architecture"] == FEW["seen"][0]]
     assert first == [(0, 0), (0, 1), (1, 0)]
 
@@ -282,7 +282,7 @@ def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_
 
     monkeypatch.setattr(tasks, "get", lambda name: built.task)
     monkeypatch.setattr(PickCube, "scoring_seeds", range(2))
-    materialise(tmp_path / "data", tmp_path / "zoo")
+    materialise(tmp_path / "data" / "PickCube-v1", tmp_path / "zoo")
     episodes = []
     rescored = rescore(tmp_path / "zoo", 9, episodes.append)
     assert all(row["agrees"] and row["now_return"] == row["stored_return"] for row in rescored)
@@ -319,13 +319,13 @@ def test_scores_of_other_ghns_are_made_again(builder, tmp_path):
         better.pack()
     better.scores()
     better.pack()
-    materialise(tmp_path / "data", tmp_path / "zoo")
+    materialise(data_folder("MNIST-PCA32"), tmp_path / "zoo")
     zoo = Zoo.open(tmp_path / "zoo")
     for row in zoo.index.to_pylist():
         policy = zoo.batch(row["architecture"], row["split"])[row["row"]]
         played = MNISTPCA32().evaluate([policy], range(100))["return"].to_numpy()
         assert row["return"] == pytest.approx(played.mean())
-    assert json.loads((tmp_path / "data" / "task.json").read_text())["build"]["ghns"]["steps"] == 30
+    assert json.loads((data_folder("MNIST-PCA32") / "task.json").read_text())["build"]["ghns"]["steps"] == 30
 
 
 def test_a_build_does_not_go_on_with_other_settings(builder, tmp_path):
@@ -358,7 +358,7 @@ def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
     more.ghns()
     more.scores()
     more.pack()
-    assert set(pq.read_table(tmp_path / "data" / "scores.parquet")["ghn_seed"].to_pylist()) == {0, 1, 2}
+    assert set(pq.read_table(data_folder("MNIST-PCA32") / "scores.parquet")["ghn_seed"].to_pylist()) == {0, 1, 2}
 
 
 def test_weight_noise_is_relative_to_each_block():

@@ -12,9 +12,9 @@ import pytest
 from nnit_zoo import tasks
 from nnit_zoo.build import expert
 from nnit_zoo.parallel import unordered
+from nnit_zoo.places import data_folder
 from nnit_zoo.sim import headless
 from nnit_zoo.sim.rollout import rollout
-from nnit_zoo.tasks.task import data_folder
 
 ROBOT_TASKS = ("PickCube-v1", "PushCube-v1", "StackCubeEasy-v1")
 STACK = tasks.get("StackCubeEasy-v1")

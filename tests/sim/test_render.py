@@ -64,12 +64,12 @@ def test_the_first_policies_of_each_architecture_are_chosen_from_all_that_run_sa
 
     task = tasks.get("PickCube-v1")
     protocol = Protocol.of(task, "unseen", only=["32-32-16-64", "16-16-16-32"])
-    entrant = SimpleNamespace(method=SimpleNamespace(name="counting"), generator=Counting(), unsupported=None)
-    chosen = film.choose(task, entrant, protocol, count, Display(quiet=True).stage)
+    entry = SimpleNamespace(method=SimpleNamespace(name="counting"), generator=Counting(), unsupported=None)
+    chosen = film.choose(task, entry, protocol, count, Display(quiet=True).stage)
     assert [title for title, _ in chosen] == titles
     assert [float(policy.layers[0][0, 0, 0]) for _, policy in chosen] == pytest.approx([*np.arange(count) + 0.01] * 2)
     with pytest.raises(UserError, match="from 1 to 10, not 11"):
-        film.choose(task, entrant, protocol, 11, Display(quiet=True).stage)
+        film.choose(task, entry, protocol, 11, Display(quiet=True).stage)
 
 
 def test_a_policy_that_cannot_play_is_not_filmed():

@@ -10,9 +10,9 @@ from nnit_zoo import tasks
 from nnit_zoo.architecture import Architecture, architectures
 from nnit_zoo.build import expert
 from nnit_zoo.errors import UserError
+from nnit_zoo.places import data_folder
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.sim.control import Controller
-from nnit_zoo.tasks.task import data_folder
 
 TASK = tasks.get("PickCube-v1")
 

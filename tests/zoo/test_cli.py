@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from nnit_zoo import export, files
+from nnit_zoo import export, files, places
 from nnit_zoo.cli import app, main
 from nnit_zoo.console import print_table
 from nnit_zoo.policy import PolicyBatch
@@ -27,7 +27,7 @@ Command = Callable[..., Result]
 
 @pytest.fixture
 def nnit_zoo(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs `nnit-zoo` with the tests' own embedded zoo and cache: (exit code, stdout, stderr)."""
+    """Runs `nnit-zoo` with the tests' own zoo and cache: (exit code, stdout, stderr)."""
 
     def run(*arguments: str) -> Result:
         monkeypatch.setattr(sys, "argv", ["nnit-zoo", *arguments])
@@ -126,10 +126,12 @@ def test_download_then_verify_then_mend(nnit_zoo: Command, home: Path) -> None:
 def test_a_split_can_be_downloaded_and_verified_alone(nnit_zoo: Command) -> None:
     plan = json.loads(nnit_zoo("download", "--split", "unseen", "--dry-run", "--json")[1])
     assert (plan["files"], plan["missing"]) == (2, 2)
-    assert nnit_zoo("download", "--split", "unseen", "--split", "excluded")[0] == 0
+    assert nnit_zoo("download", "--split", "unseen,excluded")[0] == 0
     assert "2 of 4 shards" in nnit_zoo("list")[1]
     assert nnit_zoo("verify", "--split", "unseen")[0] == 0
     assert_error(nnit_zoo("verify"), "32-16-64-32.safetensors is missing")
+    assert nnit_zoo("download", "--split", "seen,unseen", "--split", "excluded")[0] == 0
+    assert nnit_zoo("verify")[0] == 0
 
 
 def test_a_source_with_another_version_does_not_replace_the_zoo(
@@ -200,7 +202,7 @@ def test_stats_are_printed_beside_the_papers_numbers(nnit_zoo: Command, tmp_path
     code, stdout, stderr = nnit_zoo("stats", *options, "--json")
     assert code == 0, stderr
     rows = {row["measure"]: row for row in json.loads(stdout)["zoo"]}
-    zoo = Zoo.open(files.default_folder("PickCube-v1"))
+    zoo = Zoo.open(places.default_folder("PickCube-v1"))
     batch = zoo.batch("32-16-64-32", "seen")
     expected = (batch.flat()[0].double() - batch.flat()[1].double()).norm()
     assert rows["nearest L2"]["32-16-64-32"] == pytest.approx(float(expected))
@@ -256,7 +258,7 @@ def test_a_task_without_success_has_no_such_columns(
     nnit_zoo: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_data_folder(tmp_path / "embedded" / "MNIST-PCA32", "MNIST-PCA32", 32, 10)
-    monkeypatch.setattr(files, "EMBEDDED", tmp_path / "embedded")
+    monkeypatch.setattr(places, "DATA", tmp_path / "embedded")
     shown = nnit_zoo("show", "MNIST-PCA32")[1]
     assert "0.960" in shown and "success" not in shown
     assert "success" not in nnit_zoo("show", "MNIST-PCA32", "--architecture", "32-16-64-32")[1]
@@ -277,7 +279,8 @@ def test_completion_knows_the_commands() -> None:
     ("arguments", "parts"),
     [
         (("download", "--revision", "v1"), ("--source",)),
-        (("download", "--split", "unsen"), ("unseen",)),
+        (("download", "--split", "seen,unsen"), ("unseen",)),
+        (("download", "--split", ","), ("--split needs a name",)),
         (("download", "--task", "PickCub-v1"), ("PickCub-v1", "did you mean PickCube-v1?")),
         (("download", "--task", "PushCube-v1"), ("build it with: nnit-zoo build --task PushCube-v1",)),
         (("show", "PushCube-v1"), ("build it with: nnit-zoo build --task PushCube-v1",)),

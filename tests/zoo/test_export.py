@@ -16,7 +16,7 @@ from datasets import load_dataset
 from safetensors import safe_open
 from safetensors.torch import load_file
 
-from nnit_zoo import card, files, tasks
+from nnit_zoo import card, places, tasks
 from nnit_zoo.errors import UserError
 from nnit_zoo.export import export
 from nnit_zoo.materialise import materialise
@@ -49,7 +49,7 @@ def test_a_data_set_holds_every_candidates_scores(
 ) -> None:
     card.write_dataset(tmp_path / "another", [Zoo.open(made_once)])
     assert not (tmp_path / "another" / "PickCube-v1" / "build").exists()
-    monkeypatch.setattr(files, "EMBEDDED", data_folder.parent)
+    monkeypatch.setattr(places, "DATA", data_folder.parent)
     card.write_dataset(tmp_path / "ours", [Zoo.open(made_once)])
     for name in ("ghns.safetensors", "selection.parquet"):
         copy = tmp_path / "ours" / "PickCube-v1" / "build" / name
@@ -63,7 +63,7 @@ def test_a_policy_is_the_state_of_a_plain_module(made_once: Path, tmp_path: Path
     layers = ([torch.nn.Linear(*pair), torch.nn.Tanh()] for pair in itertools.pairwise(sizes))
     module = torch.nn.Sequential(*itertools.chain(*layers))[:-1]
     module.load_state_dict(load_file(tmp_path / "policy.safetensors"))
-    assert torch.equal(module(raw), zoo[ID].to_module(raw=True)(raw))
+    assert torch.equal(module(raw), zoo[ID].to_module()(raw))
     with safe_open(tmp_path / "policy.safetensors", "pt") as file:
         assert json.loads(file.metadata()["nnit"])["id"] == ID
 
@@ -71,7 +71,7 @@ def test_a_policy_is_the_state_of_a_plain_module(made_once: Path, tmp_path: Path
 def test_a_policy_as_a_program_of_torch(made_once: Path, tmp_path: Path, raw: torch.Tensor) -> None:
     export(Zoo.open(made_once), ID, tmp_path / "policy.pt2")
     module = torch.export.load(tmp_path / "policy.pt2").module()
-    expected = Zoo.open(made_once)[ID].to_module(raw=True)
+    expected = Zoo.open(made_once)[ID].to_module()
     for rows in (raw, raw[:1]):
         torch.testing.assert_close(module(rows), expected(rows))
 
@@ -80,7 +80,7 @@ def test_a_policy_as_onnx(made_once: Path, tmp_path: Path, raw: torch.Tensor) ->
     export(Zoo.open(made_once), ID, tmp_path / "policy.onnx")
     model = onnx.load(tmp_path / "policy.onnx")
     (found,) = onnx.reference.ReferenceEvaluator(model).run(None, {"observation": raw.numpy()})
-    expected = Zoo.open(made_once)[ID].to_module(raw=True)(raw)
+    expected = Zoo.open(made_once)[ID].to_module()(raw)
     np.testing.assert_allclose(found, expected.detach().numpy(), rtol=1e-4, atol=1e-5)
     assert json.loads(model.metadata_props[0].value)["id"] == ID
     assert (model.ir_version, model.opset_import[0].version) == (8, 17)  # onnxruntime 1.12 reads both
@@ -132,7 +132,8 @@ def test_datasets_reads_the_folder_and_the_cards_example_works(dataset: Path, ma
     names: dict[str, Any] = {}
     exec(example, names)
     observations = torch.randn(5, 42, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(names["network"](observations), zoo[names["policy"]["id"]].to_module()(observations))
+    module = zoo[names["policy"]["id"]].to_module(standardised=True)
+    assert torch.equal(names["network"](observations), module(observations))
     constants = json.loads((dataset / "PickCube-v1" / "task.json").read_text())
     assert np.array_equal(np.float32(constants["observation_std"]), tasks.get("PickCube-v1").observation_std)
 

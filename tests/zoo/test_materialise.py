@@ -22,9 +22,9 @@ from safetensors.torch import load_file, save_file
 from nnit_zoo import files
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.atomic import write_atomically, write_bytes
-from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import Entry, Manifest
+from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import materialise, write_manifest
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.verify import verify

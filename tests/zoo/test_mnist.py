@@ -15,13 +15,13 @@ from safetensors.torch import load_file as load_state
 from nnit_zoo import tasks
 from nnit_zoo.architecture import Architecture, architectures
 from nnit_zoo.build import mnist
-from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
+from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import stored
+from nnit_zoo.places import data_folder
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.tasks import mnist as mnist_task
 from nnit_zoo.tasks.mnist import FEATURES
-from nnit_zoo.tasks.task import data_folder
 
 SAMPLE = Path(__file__).parent / "mnist"  # the first 16 digits of each part
 TASK = tasks.get("MNIST-PCA32")

@@ -52,6 +52,16 @@ def test_module_computes_what_the_batch_computes() -> None:
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_networks_as_a_zoo_stores_them_compute_in_float32() -> None:
+    batch = random_batch().to(torch.float16)
+    observations = torch.randn(1, 10, 6, generator=torch.Generator().manual_seed(1))
+    outputs = batch(observations)
+    assert outputs.dtype == torch.float32
+    assert torch.equal(outputs, batch.to(torch.float32)(observations))
+    assert torch.equal(batch(observations.half()), batch(observations.half().float()))
+    assert batch.to(torch.float64)(observations.double()).dtype == torch.float64
+
+
 def test_module_with_folded_standardisation_takes_raw_observations() -> None:
     batch = random_batch()
     generator = torch.Generator().manual_seed(2)

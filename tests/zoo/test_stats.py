@@ -12,7 +12,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from nnit_zoo import diversity, files, stats
+from nnit_zoo import diversity, places, stats
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.cli import main
 from nnit_zoo.policy import PolicyBatch
@@ -82,7 +82,7 @@ def test_twins_are_shown_beside_the_paper_or_the_command_is_named(
     main()
     assert "nnit-zoo build --task PickCube-v1 --stage twins" in capsys.readouterr().out
     measures = dict.fromkeys((*stats.PAPER_TWINS["PickCube-v1"], "|W| r, layer 1"), 0.5)
-    monkeypatch.setattr(files, "EMBEDDED", home)
+    monkeypatch.setattr(places, "DATA", home)
     (home / "PickCube-v1").mkdir(parents=True)
     (home / "PickCube-v1" / stats.TWINS).write_text(json.dumps({"populations": {"GHN": measures, "SGD": measures}}))
     main()

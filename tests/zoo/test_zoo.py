@@ -10,8 +10,8 @@ import torch
 import nnit_zoo
 from nnit_zoo import files, tasks
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.build.ghn import GHN
 from nnit_zoo.errors import UserError
+from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import stored
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView, Zoo
@@ -107,8 +107,9 @@ def test_a_module_of_raw_observations_computes_what_the_task_computes(made_once:
     task = tasks.get("PickCube-v1")
     draws = np.random.default_rng(0).normal(size=(20, 42)).astype(np.float32)
     raw = task.observation_mean + task.observation_std * draws
-    expected = policy.to_module()(torch.from_numpy(draws))
-    torch.testing.assert_close(policy.to_module(raw=True)(torch.from_numpy(raw)), expected, rtol=1e-3, atol=1e-4)
+    expected = policy.to_module(standardised=True)(torch.from_numpy(draws))
+    torch.testing.assert_close(policy.to_module()(torch.from_numpy(raw)), expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(expected, policy.weights(torch.from_numpy(draws))[0])
     assert [type(layer) for layer in policy.to_module()] == [torch.nn.Linear, torch.nn.Tanh] * 4 + [torch.nn.Linear]
 
 
@@ -139,6 +140,41 @@ def test_load_says_what_to_do(zoo_folder: Path, home: Path, tmp_path: Path) -> N
     (place / files.MANIFEST).write_bytes(older.to_bytes())
     with pytest.raises(UserError, match="another version"):
         nnit_zoo.load("PickCube-v1")
+
+
+def test_load_makes_a_zoo_that_is_not_there(home: Path, zoo_folder: Path, tmp_path: Path) -> None:
+    for folder in (None, str(tmp_path / "mine")):
+        assert len(nnit_zoo.load("PickCube-v1", folder, download=True)) == len(nnit_zoo.load("PickCube-v1", folder))
+    older = files.Manifest.read(zoo_folder)
+    older.shards.pop("16-16-16-32.safetensors")
+    for folder in (home / "nnit" / "zoo" / "PickCube-v1", zoo_folder):
+        (folder / files.MANIFEST).write_bytes(older.to_bytes())
+        nnit_zoo.load("PickCube-v1", None if folder != zoo_folder else folder, download=True)
+    assert files.Manifest.read(home / "nnit" / "zoo" / "PickCube-v1") != older
+    assert files.Manifest.read(zoo_folder) == older  # a user's own
+    with pytest.raises(UserError, match="PickCube-v1"):
+        nnit_zoo.load("PickCub-v1", download=True)
+
+
+def test_what_is_printed_of_a_zoo_is_short_and_says_what_it_is(made_once: Path) -> None:
+    zoo = Zoo.open(made_once)
+    assert repr(zoo) == (
+        f"<Zoo of PickCube-v1 in {made_once}: 11 policies (3 seen, 2 unseen, 2 excluded, 4 heldout_seed)>"
+    )
+    assert repr(zoo.training_view()) == "<TrainingView of PickCube-v1: 3 policies of 2 architectures, to learn from>"
+    assert repr(zoo.reference_view("unseen")).endswith("2 policies of 1 architectures, for comparison only>")
+    assert repr(zoo["PickCube-v1/32-16-64-32/000"]) == (
+        "<Policy PickCube-v1/32-16-64-32/000: seen, success_at_end 0.75, success_once 1, return 38>"
+    )
+    batch = zoo.batch("32-16-64-32")
+    assert repr(batch) == "<PolicyBatch: 3 networks 32-16-64-32, 42 inputs, 8 outputs, float16>"
+
+
+def test_the_package_gives_its_main_names_and_imports_them_when_asked() -> None:
+    for name in nnit_zoo.__all__:
+        assert getattr(nnit_zoo, name).__name__ == name and name in dir(nnit_zoo)
+    with pytest.raises(AttributeError, match="no attribute 'Zo'"):
+        nnit_zoo.Zo  # type: ignore[attr-defined]  # noqa: B018
 
 
 def test_a_damaged_file_is_named_with_the_command_that_mends_it(zoo_folder: Path) -> None:

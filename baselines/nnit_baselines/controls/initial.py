@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest, refuse_reference
+from nnit_baselines.generator import Capabilities, FitOptions, Generator, SampleRequest, refuse_reference
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView
 
@@ -17,7 +17,7 @@ class Random(Generator):
 
     capabilities = Capabilities(checkpoint=False)
 
-    def fit(self, view: TrainingView, run: Run | None = None) -> None:
+    def fit(self, view: TrainingView, options: FitOptions | None = None) -> None:
         """Keep the name of the task; nothing is learned."""
         refuse_reference(view)
         self.task = view.task

@@ -13,7 +13,7 @@ import torch
 from torch.nn.functional import pad
 
 from nnit_baselines.draws import draw
-from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest, refuse_reference
+from nnit_baselines.generator import Capabilities, FitOptions, Generator, SampleRequest, refuse_reference
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
@@ -25,7 +25,7 @@ class Resized(Generator):
 
     capabilities = Capabilities(checkpoint=False)
 
-    def fit(self, view: TrainingView, run: Run | None = None) -> None:
+    def fit(self, view: TrainingView, options: FitOptions | None = None) -> None:
         """Keep the view; raises UserError for a reference view."""
         refuse_reference(view)
         self.task = view.task

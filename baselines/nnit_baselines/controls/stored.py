@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 
 from nnit_baselines.draws import draw
-from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest, refuse_reference
+from nnit_baselines.generator import Capabilities, FitOptions, Generator, SampleRequest, refuse_reference
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView
@@ -21,7 +21,7 @@ class Stored(Generator):
 
     capabilities = Capabilities(checkpoint=False)
 
-    def fit(self, view: TrainingView, run: Run | None = None) -> None:
+    def fit(self, view: TrainingView, options: FitOptions | None = None) -> None:
         """Keep the view; raises UserError for a reference view unless this is the oracle."""
         if not self.capabilities.oracle:
             refuse_reference(view)

@@ -9,7 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from nnit_baselines.generator import Capabilities, Generator, Run, SampleRequest, refuse_reference
+from nnit_baselines.generator import Capabilities, FitOptions, Generator, SampleRequest, refuse_reference
 from nnit_baselines.nnit import training
 from nnit_baselines.nnit.config import NNiTConfig, preset
 from nnit_baselines.nnit.form import Form
@@ -38,22 +38,22 @@ class NNiT(Generator):
         """An NNiT with the settings `cpu` (ours, the default) or `paper`; raises UserError for another name."""
         return cls(preset(name))
 
-    def fit(self, view: TrainingView, run: Run | None = None) -> None:
-        """Train on a view, going on from the state in `run.folder` if there is one.
+    def fit(self, view: TrainingView, options: FitOptions | None = None) -> None:
+        """Train on a view, going on from the state in `options.folder` if there is one.
 
         Stopping and resuming gives the same weights as not stopping. Raises UserError for a reference view, or if the
         state is of another training.
         """
         refuse_reference(view)
-        run = run or Run()
-        if run.steps is not None:
-            self.settings = self.settings.model_copy(update={"steps": run.steps})
+        options = options or FitOptions()
+        if options.steps is not None:
+            self.settings = self.settings.model_copy(update={"steps": options.steps})
         self.task = view.task
         with torch.random.fork_rng():
-            torch.manual_seed(run.seed)  # only the initial weights; a step's batch has a generator of its own
+            torch.manual_seed(options.seed)  # only the initial weights; a step's batch has a generator of its own
             self._take(Form.of(view, fan_in_scaling=self.settings.fan_in_scaling))
         data = [Packed.of(view.batch(each), self.form, self.settings) for each in view.architectures]
-        self.training_facts = training.train(self.model, data, self.mixture, run)
+        self.training_facts = training.train(self.model, data, self.mixture, options)
         self._restore(self.tensors())
 
     def sample(self, request: SampleRequest) -> PolicyBatch:
@@ -88,6 +88,15 @@ class NNiT(Generator):
         generator._take(Form(**form | {"vocabulary": tuple(form["vocabulary"])}))
         generator._restore(tensors)
         return generator
+
+    @property
+    def sampling_steps(self) -> int:
+        """In how many steps it samples."""
+        return self.settings.sampling_steps
+
+    @sampling_steps.setter
+    def sampling_steps(self, steps: int) -> None:
+        self.settings = self.settings.model_copy(update={"sampling_steps": steps})
 
     @property
     def mixture(self) -> Mixture:

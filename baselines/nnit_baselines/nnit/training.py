@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
-from nnit_baselines.generator import Run
+from nnit_baselines.generator import FitOptions
 from nnit_baselines.nnit.mixture import Mixture, Packed
 from nnit_baselines.nnit.model import Transformer
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo.atomic import write_atomically, write_bytes
 from nnit_zoo.errors import UserError
 
 SAVE_SECONDS = 120.0
@@ -117,14 +117,14 @@ class Trainer:
         self.step, self.seconds = state["step"], state["seconds"]
 
 
-def train(model: Transformer, data: list[Packed], mixture: Mixture, run: Run) -> dict[str, Any]:
+def train(model: Transformer, data: list[Packed], mixture: Mixture, options: FitOptions) -> dict[str, Any]:
     """Train `model` in place, to the running mean of its weights; returns the facts for config.json."""
-    trainer, settings = Trainer(model, data, mixture, run.seed), mixture.settings
-    log = Log(run)
-    if run.folder is not None:
-        run.folder.mkdir(parents=True, exist_ok=True)
-        if (run.folder / STATE).is_file():
-            trainer.load(run.folder / STATE)
+    trainer, settings = Trainer(model, data, mixture, options.seed), mixture.settings
+    log = Log(options)
+    if options.folder is not None:
+        options.folder.mkdir(parents=True, exist_ok=True)
+        if (options.folder / STATE).is_file():
+            trainer.load(options.folder / STATE)
         log.cut(trainer.step)
     started, saved = time.monotonic() - trainer.seconds, time.monotonic()
     losses: list[float] = []
@@ -135,14 +135,14 @@ def train(model: Transformer, data: list[Packed], mixture: Mixture, run: Run) ->
         if trainer.step % LOG_STEPS == 0 or done:
             log.add(trainer, losses)
             losses = []
-        if run.folder is not None and (done or time.monotonic() - saved > SAVE_SECONDS):
-            trainer.save(run.folder / STATE)
+        if options.folder is not None and (done or time.monotonic() - saved > SAVE_SECONDS):
+            trainer.save(options.folder / STATE)
             saved = time.monotonic()
-        if run.progress is not None:
-            run.progress(trainer.step, settings.steps)
+        if options.progress is not None:
+            options.progress(trainer.step, settings.steps)
     model.load_state_dict(trainer.mean.module.state_dict())
     parameters = sum(parameter.numel() for parameter in model.parameters())
-    return {"steps": settings.steps, "seconds": round(trainer.seconds), "seed": run.seed, "parameters": parameters}
+    return {"steps": settings.steps, "seconds": round(trainer.seconds), "seed": options.seed, "parameters": parameters}
 
 
 class Log:
@@ -151,9 +151,9 @@ class Log:
     Every QUALITY_STEPS steps, and at the end, also the quality of samples of architectures that are learned from.
     """
 
-    def __init__(self, run: Run) -> None:
-        self.path = run.folder / LOG if run.folder is not None else None
-        self.track = run.track
+    def __init__(self, options: FitOptions) -> None:
+        self.path = options.folder / LOG if options.folder is not None else None
+        self.track = options.track
 
     def cut(self, step: int) -> None:
         """Drop the lines after `step`, written by a run that was stopped before it saved them."""
@@ -161,11 +161,7 @@ class Log:
             return
         lines = self.path.read_text().splitlines(keepends=True)
         kept = [line for line in lines if json.loads(line)["step"] <= step]
-
-        def write(temporary: Path) -> None:
-            temporary.write_text("".join(kept))
-
-        write_atomically(self.path, write)
+        write_bytes(self.path, "".join(kept).encode())
 
     def add(self, trainer: Trainer, losses: list[float]) -> None:
         """Append the line of the last steps."""

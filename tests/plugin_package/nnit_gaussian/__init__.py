@@ -2,8 +2,8 @@
 
 import torch
 
-from nnit_baselines.generator import Capabilities, Generator, refuse_reference
-from nnit_zoo.policy import PolicyBatch
+from nnit_baselines import Capabilities, Generator, refuse_reference
+from nnit_zoo import PolicyBatch
 from nnit_zoo.views import canvas
 
 
@@ -12,7 +12,7 @@ class Gaussian(Generator):
 
     capabilities = Capabilities(widths=tuple(range(1, 65)), depths=(4,))
 
-    def fit(self, view, run=None):
+    def fit(self, view, options=None):
         """Mean and standard deviation of each cell, over the stored policies that have a weight there."""
         refuse_reference(view)
         self.task = view.task

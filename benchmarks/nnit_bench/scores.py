@@ -1,4 +1,4 @@
-"""The numbers of a result table, computed from a run's episodes: everything that is printed is a view of that table.
+"""The numbers of a result table, computed from a run's episodes.
 
 `mean` and `worst` are over everything generated. `top` is the mean of the best policies on the episodes that selected
 them, as in the paper; `top_heldout` is their mean on others.
@@ -21,9 +21,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from nnit_bench.protocol import Metric, Protocol
+from nnit_bench.protocol import Protocol
 from nnit_bench.statistics import Estimate, Floats, Ints, mean
 from nnit_zoo.architecture import hidden_widths, split_of
+from nnit_zoo.tasks.metric import Metric
 
 FUNCTIONAL = 0.5  # headline score from which a policy counts as functional (NNiT appendix I does not say)
 
@@ -83,7 +84,7 @@ class Summary:
     """On `joint`, what the generator chose."""
 
 
-def scores(episodes: pa.Table, metrics: Sequence[Metric]) -> Scores:
+def from_episodes(episodes: pa.Table, metrics: Sequence[Metric]) -> Scores:
     """The scores in a table of episodes of one phase, in which every policy plays the same ones."""
     episodes = episodes.sort_by([("policy", "ascending"), ("episode_seed", "ascending")])
     numbers, first = np.unique(episodes["policy"].to_numpy(), return_index=True)
@@ -103,7 +104,7 @@ def phase(episodes: pa.Table, name: str) -> pa.Table:
 
 def everything(episodes: pa.Table, protocol: Protocol) -> Scores:
     """The scores of all generated policies, on the episodes that every one plays."""
-    return scores(phase(episodes, "select"), protocol.metrics)
+    return from_episodes(phase(episodes, "select"), protocol.metrics)
 
 
 def ranked(table: Scores, metrics: Sequence[Metric]) -> Ints:
@@ -122,7 +123,7 @@ def selected(episodes: pa.Table, protocol: Protocol) -> dict[str, Scores]:
     best = ranked(table, protocol.metrics)[: protocol.top]
     found = {"top": table.of(best)}
     if protocol.report:
-        found["top_heldout"] = scores(phase(episodes, "report"), protocol.metrics).of(best)
+        found["top_heldout"] = from_episodes(phase(episodes, "report"), protocol.metrics).of(best)
     elif protocol.selection == "heldout" and len(table.seeds) > 1:
         even = table.seeds % 2 == 0
         best = ranked(table.during(even), protocol.metrics)[: protocol.top]
@@ -193,11 +194,6 @@ def clusters(table: Scores, protocol: Protocol) -> NDArray[np.str_] | None:
     return None if protocol.is_joint or len(set(table.architectures.tolist())) == 1 else table.architectures
 
 
-def bounds(metric: Metric) -> tuple[float, float] | None:
-    """The least and the largest value that a score can have."""
-    return (0.0, 1.0) if metric.unit == "%" else None
-
-
 def top_curve(episodes: pa.Table, protocol: Protocol) -> tuple[Floats, Floats]:
     """The headline's mean over the best k policies, for k = 1 .. all: on the same episodes, and held out, [all] each.
 
@@ -221,7 +217,7 @@ def _estimate(
 ) -> Estimate:
     """One estimate, with a random state of its own: it is the same whatever else is computed."""
     rng = np.random.default_rng(0)
-    return mean(table.values[metric.column], drawn_together, rng, drawn=drawn, bounds=bounds(metric))
+    return mean(table.values[metric.column], drawn_together, rng, drawn=drawn, bounds=metric.bounds)
 
 
 def _chosen(table: Scores, top: Scores, headline: Metric) -> Architectures:

@@ -1,0 +1,51 @@
+"""Which zoos ship with this package, and in which folders zoos lie; imports no torch."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pyarrow as pa
+from huggingface_hub import cached_assets_path
+
+from nnit_zoo import tasks
+from nnit_zoo.errors import UserError, unknown_name
+from nnit_zoo.files import INDEX, MANIFEST, Manifest, read_index
+
+DATA = Path(__file__).parent / "data"
+
+
+def data_folder(task: str) -> Path:
+    """The folder of the package that holds what is shipped of a task, and that `nnit-zoo build` writes."""
+    return DATA / task
+
+
+def tasks_with_zoo() -> tuple[str, ...]:
+    """The tasks whose zoo ships with this package."""
+    return tuple(sorted(path.parent.name for path in DATA.glob(f"*/{MANIFEST}")))
+
+
+def shipped(task: str) -> tuple[Manifest, pa.Table]:
+    """Manifest and index of the zoo that ships for the task; raises UserError, with what to do, if none does."""
+    if task not in tasks_with_zoo():
+        if task in tasks.names():
+            raise UserError(f"{task} has no zoo yet; build it with: nnit-zoo build --task {task}")
+        raise unknown_name("zoo", task, tasks_with_zoo())
+    return Manifest.read(data_folder(task)), read_index(data_folder(task) / INDEX)
+
+
+def default_folder(task: str) -> Path:
+    """Where `nnit-zoo download` puts the task's zoo: in the assets cache of huggingface_hub (HF_HOME moves it).
+
+    Raises UserError if that folder cannot be made.
+    """
+    try:
+        return cached_assets_path("nnit", "zoo", task)
+    except (OSError, ValueError) as error:
+        raise UserError(f"no cache folder for zoos ({error}); set HF_HOME to a folder that you can write") from None
+
+
+def download_command(task: str, folder: Path) -> str:
+    """The command that makes the zoo in `folder`, or mends it."""
+    where = "" if folder.resolve() == default_folder(task) else f" --folder {shlex.quote(str(folder))}"
+    return f"nnit-zoo download --task {task}{where}"
