@@ -35,14 +35,16 @@ def test_imports_point_in_one_direction(package: str) -> None:
 
 @pytest.mark.parametrize("module", ["nnit_zoo", "nnit_zoo.cli", "nnit_bench.cli", "nnit_leaderboard", "nnit_zoo.tasks"])
 def test_importing_is_light(module: str) -> None:
-    code = f"import sys, {module}; print([name for name in {HEAVY} if name in sys.modules])"
+    """And so is asking for the tasks' names: a task itself needs torch."""
+    ask = "nnit_zoo.tasks.names(); " if module == "nnit_zoo.tasks" else ""
+    code = f"import sys, {module}; {ask}print([name for name in {HEAVY} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("command", ["nnit_zoo.cli", "nnit_bench.cli"])
-def test_help_imports_no_torch(command: str) -> None:
-    code = f"import sys; from {command} import app; app(['--help'], result_action='return_value')"
+def test_help_imports_no_torch() -> None:
+    """That of `nnit-zoo`, which imports still less, is tested with that command."""
+    code = "import sys; from nnit_bench.cli import app; app(['--help'], result_action='return_value')"
     code += f"; sys.stderr.write(str([name for name in {HEAVY} if name in sys.modules]))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "Usage" in done.stdout and done.stderr == "[]"

@@ -35,21 +35,12 @@ def policies_of(*hidden):
 
 
 @pytest.mark.parametrize("name", CONTROLS)
-def test_a_control_gives_what_is_asked_and_repeats_itself(name, view):
+def test_a_control_gives_what_is_asked(name, view):
+    """More than is stored, too; `test_check` holds it to the rest of the contract."""
     control, wanted = fitted(name, view), view.architectures[1]
     assert control.supports(wanted)
-    request = SampleRequest(wanted, 6, seed=1)
-    batch = control.sample(request)
+    batch = control.sample(SampleRequest(wanted, 6, seed=1))
     assert (batch.architecture, len(batch)) == (wanted, 6)
-    assert torch.equal(batch.flat(), control.sample(request).flat())
-    other = control.sample(SampleRequest(wanted, 6, seed=2)).flat()
-    assert torch.equal(batch.flat(), other) == control.capabilities.deterministic
-
-
-@pytest.mark.parametrize("name", [name for name in CONTROLS if name != "ghn-oracle"])
-def test_a_control_refuses_a_reference_view(name, view):
-    with pytest.raises(UserError, match="never for training"):
-        registry.get(name)().fit(TrainingView(view.task, view.batches, reference=True))
 
 
 @pytest.mark.parametrize("name", ["zoo", "noise-0.03", "mean", "ghn-oracle"])

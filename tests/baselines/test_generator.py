@@ -120,16 +120,6 @@ def test_a_method_without_a_checkpoint_is_fitted_with_the_runs_seed(plugin, view
     assert [run.seed for run in runs] == [3]
 
 
-def test_an_installed_entry_point_is_a_method(plugin, monkeypatch):
-    folder = plugin.parent / "plugin-1.0.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text("[nnit.generators]\nconstant = plugin:Constant\n")
-    monkeypatch.syspath_prepend(plugin.parent)
-    assert "constant" in registry.names()
-    assert registry.get("constant").__name__ == "Constant"
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -178,6 +168,19 @@ def test_a_method_without_a_shipped_checkpoint_says_how_to_train_it(plugin):
     zoo = SimpleNamespace(task="Push")
     with pytest.raises(UserError, match=r"nnit-bench train --method .*Constant --task Push"):
         registry.prepare(f"{plugin}:Constant", zoo, "unseen")
+
+
+def test_a_named_checkpoint_goes_before_the_shipped_one(plugin, tmp_path, monkeypatch):
+    kind = registry.get(f"{plugin}:Constant")
+    for value, folder in enumerate((tmp_path / "shipped" / "constant" / "Push", tmp_path / "mine")):
+        made = kind()
+        made.task, made.value = "Push", value
+        made.save_pretrained(folder)
+    monkeypatch.setattr(registry, "get", lambda name: kind)
+    monkeypatch.setattr(registry, "CHECKPOINTS", tmp_path / "shipped")
+    zoo = SimpleNamespace(task="Push")
+    assert registry.prepare("constant", zoo, "unseen").value == 0
+    assert registry.prepare("constant", zoo, "unseen", tmp_path / "mine").value == 1
 
 
 def test_a_control_is_fitted_on_the_training_view_and_an_oracle_on_the_reference(view):

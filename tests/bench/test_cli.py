@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from nnit_baselines import registry
+from nnit_baselines.nnit.config import PRESETS, NNiTConfig
 from nnit_bench import cli
 from nnit_zoo import places, tasks
 from nnit_zoo.architecture import hidden_widths
@@ -67,6 +69,14 @@ def test_a_fresh_machine_gets_its_zoo_and_its_table(
 
     assert call("compare", "crop", next(fresh.glob("*/*/*Zeros/*")), *what[:2], "--results", fresh) == 0
     assert "my_method.py:Zeros cannot be told apart in mean success at end" in capsys.readouterr().out
+    assert call("compare", "crop", "crop", *what[:2], "--results", fresh, "--json") == 0
+    compared = json.loads(capsys.readouterr().out)
+    assert [Path(folder).parent.name for folder in compared["folders"]] == ["crop", "crop"]
+    first = compared["differences"][0]
+    assert (first["metric"], first["statistic"], first["separable"]) == ("success_at_end", "mean", False)
+    assert first["difference"] == {"value": 0, "low": 0, "high": 0}
+    statistics = {each["statistic"] for each in compared["differences"]}
+    assert statistics == {"mean", "top", "top_heldout"}
 
 
 def test_several_splits_and_what_a_method_cannot(call: Call, fresh: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,7 +131,12 @@ def test_a_crash_in_a_plug_in_does_not_cost_the_others(
     assert call("run", "--method", f"{plugin}:Zeros,crop", *what) == 1
     out, err = capsys.readouterr()
     assert "crop" in out and f'File "{plugin}", line' in err
-    assert err.splitlines()[-1].endswith("AttributeError: module 'torch' has no attribute 'zeroes'")
+    why = "AttributeError: module 'torch' has no attribute 'zeroes'"
+    assert err.splitlines()[-1].endswith(why)
+    assert call("run", "--method", f"{plugin}:Zeros,crop", *what, "--json") == 1
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["errors"] == [f"{plugin}:Zeros on Formula-v1, unseen: {why}"]
+    assert [run["method"]["name"] for run in printed["tables"][0]["runs"]] == ["crop"]
 
 
 def test_one_failure_does_not_cost_the_others(
@@ -150,6 +165,28 @@ def test_one_failure_does_not_cost_the_others(
     assert sorted(statuses.values()) == ["failed", "success"] and statuses["crop"] == "failed"
 
 
+def test_options_reach_the_work(
+    call: Call, fresh: Path, task: Any, generator: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, evaluate = [], task.evaluate
+
+    def note(*arguments: Any, **options: Any) -> Any:
+        asked.append((options["workers"], options["parallel"]))
+        return evaluate(*arguments, **options)
+
+    monkeypatch.setattr(task, "evaluate", note)
+    monkeypatch.setattr(registry, "get", lambda name: type(generator))
+    monkeypatch.setattr(registry, "prepare", lambda *how: generator)
+    how = ["--workers", "3", "--parallel", "ray", "--sampling-steps", "2", "--protocol", "paper"]
+    what = ["run", "--task", "Formula-v1", "--episodes", "2", "--policies", "1", *how, "--output", fresh, "--quiet"]
+    assert call(*what) == 0
+    assert asked == [(3, "ray")] and generator.sampling_steps == 2
+    assert call(*what) == 0
+    assert len(asked) == 1
+    assert call(*what, "--overwrite", "always") == 0
+    assert len(asked) == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -162,6 +199,7 @@ def test_one_failure_does_not_cost_the_others(
         (["--episodes", "0"], "is scored on 1 to"),
         (["--policies", "0"], "--policies must be 1 or more"),
         (["--workers", "0"], "--workers must be 1 or more"),
+        (["--task", "MNIST-PCA32", "--sim", "stock"], "MNIST-PCA32 is not simulated: leave --sim stock out"),
         (["--overwrite", "sometimes"], "--overwrite"),
         (["--polices", "3"], "--polices"),
     ],
@@ -208,7 +246,9 @@ def test_list_names_methods_and_tasks(call: Call, capsys: pytest.CaptureFixture[
     assert "PickCube-v1" in listed["tasks"]
 
 
-def test_a_training_is_tracked_live(call: Call, fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_follows_its_options_and_is_tracked_live(
+    call: Call, fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Against trackio's own names and arguments."""
     calls: list[Any] = []
 
@@ -220,9 +260,21 @@ def test_a_training_is_tracked_live(call: Call, fresh: Path, tmp_path: Path, mon
 
     stand_in = SimpleNamespace(init=init, log=log, finish=lambda: calls.append("finish"))
     monkeypatch.setitem(sys.modules, "trackio", stand_in)
-    what = ["train", "--task", "Formula-v1", "--steps", "1", "--output", tmp_path / "trained", "--trackio", "mine"]
-    assert call(*what) == 0
-    assert calls == [("mine", "nnit-Formula-v1-0", "allow"), (1, True, False), "finish"]
+    small = NNiTConfig(width=16, depth=1, heads=1, batch=2, sampling_steps=2)
+    monkeypatch.setitem(PRESETS, "small", small)
+    what = ["--task", "Formula-v1", "--preset", "small", "--steps", "1", "--seed", "3", "--trackio", "mine"]
+    assert call("train", *what, "--output", tmp_path / "trained") == 0
+    assert calls == [("mine", "nnit-Formula-v1-3", "allow"), (1, True, False), "finish"]
+    config = json.loads((tmp_path / "trained" / "config.json").read_text())
+    assert config["settings"] == small.model_dump() | {"steps": 1}
+    facts = config["training"]
+    assert (facts["seed"], facts["steps"], facts["preset"]) == (3, 1, "small")
+    assert (tmp_path / "trained" / "state" / "state.pt").is_file()
+
+
+def test_what_needs_no_training_is_not_trained(call: Call, fresh: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("train", "--method", "crop", "--task", "Formula-v1") == 2
+    assert "crop needs no training; run: nnit-bench run --method crop" in capsys.readouterr().err
 
 
 def test_tracking_without_trackio_says_how_to_get_it(

@@ -29,12 +29,15 @@ def outcomes(shift: float, seed: int, columns: int = 20) -> np.ndarray:
 
 def test_a_difference_is_seen_through_what_both_share(store: Store, protocol: Protocol) -> None:
     """The intervals of the two overlap widely; paired, the difference stands out."""
+    protocol = protocol.model_copy(update={"selection": "heldout"})  # on halves, as on a test set
     better = store("better", protocol, outcomes(0.5, 1))
     worse = store("worse", protocol, outcomes(0.0, 2))
     found = {each.statistic: each for each in compare.differ(better, worse) if each.metric == "success_at_end"}
     mean = found["mean"]
     assert mean.separable and mean.difference.low > 0
-    assert mean.difference.value == pytest.approx(mean.first - mean.second)
+    assert found.keys() == {"mean", "top", "top_heldout"}
+    for each in found.values():
+        assert each.first > each.second and each.difference.value == pytest.approx(each.first - each.second)
     first, second = (run.record.results.estimates["success_at_end"]["mean"] for run in (better, worse))  # type: ignore[union-attr]
     assert first.low < second.high
     words = compare.in_words("better", "worse", mean, protocol.metrics[0])

@@ -1,7 +1,6 @@
 """Plug-ins: the worked example in the docs, and a package installed from `tests/plugin_package`."""
 
 import re
-import shlex
 import subprocess
 import sys
 from importlib import metadata
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-import nnit_bench.cli
 from nnit_baselines import registry
 from nnit_bench.check import examine, synthetic_view
 from nnit_zoo.errors import UserError
@@ -23,20 +21,27 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
 
 
-@pytest.fixture
-def installed(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
     """The package, installed by pip into a folder of its own, and beside it one that fails to load."""
+    folder = tmp_path_factory.mktemp("installed")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*command, "--target", tmp_path, PACKAGE], check=True, capture_output=True)
-    broken = tmp_path / "broken-1.0.dist-info"
+    subprocess.run([*command, "--target", folder, PACKAGE], check=True, capture_output=True)
+    broken = folder / "broken-1.0.dist-info"
     broken.mkdir()
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
     (broken / "entry_points.txt").write_text(
         "[nnit.generators]\nbroken = broken_plugin:Method\ncrop = elsewhere:Crop\n"
     )
-    (tmp_path / "broken_plugin.py").write_text("raise ValueError('half-written')\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    yield tmp_path
+    (folder / "broken_plugin.py").write_text("raise ValueError('half-written')\n")
+    return folder
+
+
+@pytest.fixture
+def installed(folder, monkeypatch):
+    """The folder, on the path."""
+    monkeypatch.syspath_prepend(folder)
+    yield folder
     for name in ("nnit_gaussian", "broken_plugin"):
         sys.modules.pop(name, None)
 
@@ -54,21 +59,14 @@ def test_the_example_is_the_package_that_is_installed_here():
     assert blocks("toml")[0] in (PACKAGE / "pyproject.toml").read_text()
 
 
-@pytest.mark.parametrize("command", [line for block in blocks("sh") for line in block.splitlines()])
-def test_shell_command_parses(command):
-    program, *arguments = shlex.split(command)
-    assert program == "nnit-bench"
-    nnit_bench.cli.app.parse_args(arguments, exit_on_error=False, print_error=False)
-
-
-def test_an_installed_package_offers_its_method_by_name(installed):
+def test_an_installed_package_offers_its_method_by_name(installed, tmp_path):
     assert "gaussian" in registry.names()
     kind = registry.get("gaussian")
     assert Path(sys.modules[kind.__module__].__file__).is_relative_to(installed)
     made = kind()
     made.fit(synthetic_view())
-    made.save_pretrained(installed / "checkpoint")
-    assert kind.from_pretrained(installed / "checkpoint").task == made.task
+    made.save_pretrained(tmp_path)
+    assert kind.from_pretrained(tmp_path).task == made.task
     with pytest.raises(UserError, match="did you mean gaussian"):
         registry.get("gausian")
 

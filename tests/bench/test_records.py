@@ -70,7 +70,8 @@ def test_the_number_of_workers_is_no_part_of_a_run() -> None:
     assert "workers" not in first.model_dump_json()
 
 
-@pytest.mark.parametrize("module", ["records", "results", "compare", "report", "paper"])
-def test_stored_results_are_read_without_torch(module: str) -> None:
-    code = f"import sys, nnit_bench.{module}; sys.exit('torch' in sys.modules)"
+def test_stored_results_are_read_without_torch() -> None:
+    code = (
+        "import sys; from nnit_bench import compare, paper, records, report, results; sys.exit('torch' in sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

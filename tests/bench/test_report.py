@@ -4,16 +4,21 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
-from nnit_bench import paper, results
+from nnit_bench import paper, results, tables
 from nnit_bench.protocol import Protocol, SeedRange
+from nnit_bench.records import Distance, Novelty
 from nnit_bench.report import report
 from nnit_bench.results import StoredRun
+from nnit_bench.runner import Outcome
+from nnit_bench.statistics import Estimate
 from nnit_zoo.errors import UserError
 from nnit_zoo.tasks.metric import Metric
 
@@ -34,6 +39,36 @@ def pick(task: Any) -> Protocol:
 
 def joint_of(protocol: Protocol) -> Protocol:
     return protocol.model_copy(update={"split": "joint", "policies": {"any": 100}})
+
+
+def test_every_number_stands_in_its_column(
+    store: Store, pick: Protocol, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = store("nnit", pick, outcomes(0.9, 80))
+    assert run.record.results is not None
+    values = {"mean": 0.1, "top": 0.2, "top_heldout": 0.3, "worst": 0.4}
+    exact = {name: Estimate(value, value, value) for name, value in values.items()}
+    novelty = Novelty(
+        same_architecture=Distance(median=0.5, heldout=None, ratio=1.5),
+        any_architecture=Distance(median=0.6, heldout=None, ratio=1.6),
+        actions=Distance(median=0.7, heldout=None, ratio=1.7),
+        copies=8,
+        pairwise_l2=0.9,
+        pairwise_cosine=0.95,
+    )
+    found = replace(
+        run.record.results, estimates={metric.column: exact for metric in pick.metrics}, worst="16-16-16-32"
+    )
+    record = run.record.model_copy(update={"results": found, "novelty": novelty})
+    tables.show(tables.Results(pick, [Outcome(record, run.folder, reused=False, zeroed={})], None))
+    scores, new = (line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("nnit "))
+    assert scores[-4:] == ["10.0", "20.0", "30.0", "40.0"]
+    assert new == ["nnit", "50.0%", "(1.50)", "60.0%", "(1.60)", "0.700", "(1.70)", "8", "0.95"]
+
+    record.write(run.folder)
+    report(folders=(tmp_path,), output=tmp_path / "report")
+    row = "| nnit | 10.0 | 20.0 | 30.0 | 40.0 16-16-16-32 |  | 50.0% (1.50) |"
+    assert row in (tmp_path / "report" / "report.md").read_text().splitlines()
 
 
 def test_a_damaged_record_stops_nothing(store: Store, pick: Protocol, capsys: pytest.CaptureFixture[str]) -> None:
@@ -157,6 +192,17 @@ def test_our_row_stands_under_the_papers(store: Store, pick: Protocol, capsys: p
     assert max(len(line) for line in out.splitlines() if not line.startswith("missing")) <= 80
     paper.reproduce(table="full-distribution", folders=folders, as_json=True)
     assert json.loads(capsys.readouterr().out)[0]["rows"][0]["cells"][0]["value"] == 78.8
+
+
+def test_the_papers_data_set_stands_over_the_mean_of_our_seen_policies(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = {"split": ["seen", "seen", "unseen"], "return": [40.0, 38.5, 0.0], "success_at_end": [1.0, 0.9, 0.0]}
+    monkeypatch.setattr(paper.places, "tasks_with_zoo", lambda: ("PushCube-v1", "MNIST-PCA32"))
+    monkeypatch.setattr(paper.places, "shipped", lambda task: (None, pa.table(columns)))
+    (table,) = paper.main_table({})
+    theirs, ours = table.rows[:2]
+    assert (theirs.label, ours.label, ours.source) == ("Dataset, seen", "Dataset, seen", "here")
+    assert [cell and cell.value for cell in theirs.cells[2:4]] == [42.02, 100]
+    assert [cell and cell.value for cell in ours.cells] == [None, None, 39.2, 95, None, None]
 
 
 def test_what_the_generator_chose_stands_beside_the_papers(store: Store, pick: Protocol) -> None:

@@ -27,6 +27,8 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import materialise
 from nnit_zoo.places import data_folder
+from nnit_zoo.sim.control import Controller
+from nnit_zoo.sim.rollout import rollout
 from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
 from nnit_zoo.verify import rescore
@@ -117,6 +119,7 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
         "unseen": 1,
         "excluded": 1,
     }
+    assert zoo.manifest.standardisation == PickCube().standardisation
     record = json.loads((data_folder("PickCube-v1") / "task.json").read_text())
     assert record["build"]["expert"]["config"]["hidden"] == 16
     assert record["build"]["ghns"]["states"] == 2 * 2 * 50
@@ -359,6 +362,62 @@ def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
     more.scores()
     more.pack()
     assert set(pq.read_table(data_folder("MNIST-PCA32") / "scores.parquet")["ghn_seed"].to_pylist()) == {0, 1, 2}
+
+
+class Short(PickCube):
+    episode_steps = 3
+
+
+def toy_network():
+    torch.manual_seed(0)
+    network = expert.network_of(expert.ActorCritic(42, 8, 16, -0.5).actor)
+    return [(weight * (30 if number == 3 else 1), bias) for number, (weight, bias) in enumerate(network)]
+
+
+def test_teacher_and_students_act_as_often_as_they_should():
+    task, network, seeds = Short(), toy_network(), range(2)
+    student = [layer[0].numpy() for layer in GHN(42, 8, seed=0).emit(Architecture(42, (16, 16, 16, 16), 8)).layers]
+    students = dict.fromkeys(seeds, student)
+    controller = Controller([student] * 2, task.observation_mean, task.observation_std)
+    teachers, theirs = expert.play(task, network, seeds), rollout(task, seeds, controller)
+    for beta, episodes in ((1, teachers), (0, theirs)):
+        states = distill.collect(task, network, students, beta, 0, seeds)
+        np.testing.assert_array_equal(states, episodes.observations[:-1].reshape(-1, 42))
+    assert not np.array_equal(teachers.observations, theirs.observations)
+
+
+def test_the_expert_labels_raw_observations_and_students_see_standardised_ones():
+    task, network = PickCube(), toy_network()
+    raw = np.random.default_rng(0).normal(size=(5, 42)).astype(np.float32)
+    inputs, labels = distill.labelled(task, network, raw)
+    np.testing.assert_allclose(labels, expert.mean_action(network, raw).clip(-1, 1), rtol=1e-6)
+    np.testing.assert_allclose(inputs.numpy() * task.observation_std + task.observation_mean, raw, atol=1e-5)
+
+
+def test_no_ghn_and_no_round_plays_the_episodes_of_another(tmp_path, monkeypatch):
+    played = []
+
+    def note(task, fit, seeds):
+        played.extend(seeds)
+        return np.zeros((8, 42), np.float32)
+
+    monkeypatch.setattr(distill, "_own_states", note)
+    distill._save_states(tmp_path / "states", np.zeros((8, 42), np.float32))
+    for seed in (0, 1):
+        distill.train_ghn(PickCube(), TINY_DISTILL, toy_network(), tmp_path / "states", tmp_path / str(seed), seed)
+    assert len(played) == len(set(played)) == 2 * TINY_DISTILL.own_rounds * TINY_DISTILL.own_episodes
+
+
+def test_the_best_expert_is_kept_and_not_the_last(tmp_path, monkeypatch):
+    scores = iter([1.0, 3.0, 2.0])
+    best = {"success_once": 0.0, "success_at_end": 0.0, "episodes": 2}
+    monkeypatch.setattr(expert, "EVALUATION_SEEDS", range(1))
+    monkeypatch.setattr(expert, "summarise", lambda episodes: {"return": next(scores), **best})
+    networks = []
+    monkeypatch.setattr(expert, "save", lambda network, path: networks.append(network))
+    record = expert.train(PickCube(), TINY_EXPERT.model_copy(update={"total_steps": 300}), tmp_path, 1, print)
+    assert (record["return"], record["steps"], len(networks)) == (3, 200, 2)
+    assert json.loads((tmp_path / "record.json").read_text()) == record
 
 
 def test_weight_noise_is_relative_to_each_block():

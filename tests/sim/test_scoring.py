@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +15,7 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.places import data_folder
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.sim.control import Controller
+from nnit_zoo.tasks import robot
 
 TASK = tasks.get("PickCube-v1")
 
@@ -79,6 +82,14 @@ def test_a_policy_that_is_not_finite_scores_zero_with_a_reason_and_does_not_touc
     rows = TASK.evaluate([broken], [4], workers=1).to_pylist()
     assert (rows[0]["return"], rows[0]["success_once"], rows[0]["reason"]) == (0, False, "not finite")
     assert {**rows[1], "policy": 0} == TASK.evaluate([batch[1]], [4], workers=1).to_pylist()[0]
+
+
+def test_success_once_and_at_the_end_are_told_apart(monkeypatch):
+    success = (np.arange(50) == 10)[:, None]
+    played = SimpleNamespace(rewards=np.full((50, 1), 0.5, np.float32), success=success)
+    monkeypatch.setattr(robot, "rollout", lambda *_: played)
+    [row] = TASK.evaluate([noisy_policies(1)[0]], [0], workers=1).to_pylist()
+    assert (row["return"], row["success_once"], row["success_at_end"]) == (25, True, False)
 
 
 def test_controller_agrees_with_the_policy_batch():

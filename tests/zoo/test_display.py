@@ -1,4 +1,4 @@
-"""Progress in a log: how much is done, how fast, and how long it will take."""
+"""Progress, in a log or on a terminal: how much is done, how fast, and how long it will take."""
 
 from __future__ import annotations
 
@@ -29,6 +29,13 @@ def test_a_log_gets_rate_and_time_left(clock, capsys):
         "episodes: 710 of 2000, 10/s, 129 s left",
         "episodes: 2000 of 2000 in 41 s",
     ]
+
+
+def test_a_terminal_gets_a_bar(monkeypatch, capsys):
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    with display.Display(quiet=False).stage("episodes", 4) as stage:
+        stage(3)
+    assert "3/4" in capsys.readouterr().err
 
 
 def test_slow_work_is_told_in_minutes_and_hours(clock, capsys):

@@ -214,13 +214,13 @@ def test_machines_that_round_a_tie_to_different_sides_make_the_same_bytes(
         materialise(ours, tmp_path / "damaged")  # no rounding of another machine moves a parameter that far
 
 
-def tamper(folder: Path, change: Callable[[list[dict[str, Any]], np.ndarray[Any, Any]], None]) -> None:
-    """Change the index or the first layer of a shard, and make the checksums right again."""
+def tamper(folder: Path, change: Callable[[list[dict[str, Any]], dict[str, torch.Tensor]], None]) -> None:
+    """Change the index or a shard, and make the checksums right again."""
     manifest = Manifest.read(folder)
     name = "32-16-64-32.safetensors"
     rows = files.read_index(folder / files.INDEX).to_pylist()
     tensors = load_file(folder / name)
-    change(rows, tensors["layers.0"].numpy())
+    change(rows, tensors)
     save_file(tensors, folder / name)
     pq.write_table(pa.Table.from_pylist(rows, files.INDEX_SCHEMA), folder / files.INDEX)
     manifest.shards[name] = Entry.of((folder / name).read_bytes())
@@ -231,8 +231,8 @@ def tamper(folder: Path, change: Callable[[list[dict[str, Any]], np.ndarray[Any,
 def test_verify_looks_behind_the_checksums(zoo_folder: Path) -> None:
     assert verify(zoo_folder) == []
 
-    def change(rows: list[dict[str, Any]], layer: np.ndarray[Any, Any]) -> None:
-        layer[1, 0, 0] = np.nan
+    def change(rows: list[dict[str, Any]], tensors: dict[str, torch.Tensor]) -> None:
+        tensors["layers.0"][1, 0, 0] = np.nan
         heldout = next(row for row in rows if row["split"] == "heldout_seed")
         heldout["split"] = "seen"  # a reference policy smuggled into the training split
 
@@ -242,3 +242,14 @@ def test_verify_looks_behind_the_checksums(zoo_folder: Path) -> None:
     assert "gives no finite actions" in text
     assert "is not the one in the index" in text
     assert "PickCube-v1/32-16-64-32/128 has split 'seen' in the index, but should have 'heldout_seed'" in text
+
+
+def test_a_policy_listed_twice_and_other_numbers_than_float16_are_found(zoo_folder: Path) -> None:
+    def widen(rows: list[dict[str, Any]], tensors: dict[str, torch.Tensor]) -> None:
+        rows.pop()
+        tensors["layers.1"] = tensors["layers.1"].float()
+
+    tamper(zoo_folder, lambda rows, tensors: rows.append(rows[-1]))
+    assert f"{zoo_folder / files.INDEX} lists a policy twice" in verify(zoo_folder)
+    tamper(zoo_folder, widen)
+    assert verify(zoo_folder) == [f"{zoo_folder / '32-16-64-32.safetensors'} does not hold float16 parameters"]

@@ -177,6 +177,17 @@ def test_the_package_gives_its_main_names_and_imports_them_when_asked() -> None:
         nnit_zoo.Zo  # type: ignore[attr-defined]  # noqa: B018
 
 
+def test_policies_for_another_standardisation_are_refused(zoo_folder: Path) -> None:
+    manifest = files.Manifest.read(zoo_folder)
+    manifest.standardisation = tasks.get("PickCube-v1").standardisation
+    (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
+    assert len(Zoo.open(zoo_folder)) == 11
+    manifest.standardisation = "another"
+    (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
+    with pytest.raises(UserError, match="standardised otherwise"):
+        Zoo.open(zoo_folder)
+
+
 def test_a_damaged_file_is_named_with_the_command_that_mends_it(zoo_folder: Path) -> None:
     shard = zoo_folder / "32-16-64-32.safetensors"
     content = bytearray(shard.read_bytes())
