@@ -80,6 +80,7 @@ class RobotBuilder(Builder):
             log("states: done")
             return
         distill.gather_states(self.task, self.distill_config, self._expert(), self.work / "states", self.workers, log)
+        self._record(states={**self.distill_config.model_dump(), "commit": str(commit())})
 
     def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
         """Regression onto the expert, on the buffer and on states of the GHN's own."""

@@ -123,6 +123,7 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
     record = json.loads((data_folder("PickCube-v1") / "task.json").read_text())
     assert record["build"]["expert"]["config"]["hidden"] == 16
     assert record["build"]["ghns"]["states"] == 2 * 2 * 50
+    assert record["build"]["states"]["rounds"] == 2 and record["build"]["states"]["commit"]
 
 
 def test_a_killed_build_of_mnist_ends_with_the_same_bytes_and_a_zoo_with_accuracies(builder, tmp_path, monkeypatch):
