@@ -81,8 +81,7 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
             print_table(("input", "entries"), list(zoo["layout"].items()))
         return
     check_known([architecture])
-    _, index = places.shipped(task)
-    policies = [row for row in index.to_pylist() if row["architecture"] == architecture]
+    policies = places.index(task, architecture).to_pylist()
     if as_json:
         print_json(policies)
         return
@@ -272,7 +271,7 @@ def card(*, task: Names = (), as_json: Json = False) -> None:
         return
     from nnit_zoo.card import readme
 
-    sys.stdout.write(readme([places.shipped(name) for name in chosen]))
+    sys.stdout.write(readme([(places.manifest(name), places.index(name)) for name in chosen]))
 
 
 @app.command

@@ -34,13 +34,13 @@ class Download:
         if source is None:
             if revision:
                 raise UserError("--revision says which version of a --source: give both")
-            self.manifest, self._index = places.shipped(task)
+            self.manifest, self._index = places.manifest(task), places.index(task)
             self._bring = partial(_make, places.data_folder(task))
             return
         from nnit_zoo.hub import Source  # noqa: PLC0415  most zoos come from no source
 
         found = Source(source, task, revision)
-        if folder is None and found.manifest != places.shipped(task)[0]:
+        if folder is None and found.manifest != places.manifest(task):
             raise UserError(
                 f"{source} holds another version of the zoo than this nnit; keep it elsewhere with --folder"
             )

@@ -25,13 +25,22 @@ def tasks_with_zoo() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in DATA.glob(f"*/{MANIFEST}")))
 
 
-def shipped(task: str) -> tuple[Manifest, pa.Table]:
-    """Manifest and index of the zoo that ships for the task; raises UserError, with what to do, if none does."""
-    if task not in tasks_with_zoo():
-        if task in tasks.names():
-            raise UserError(f"{task} has no zoo yet; build it with: nnit-zoo build --task {task}")
-        raise unknown_name("zoo", task, tasks_with_zoo())
-    return Manifest.read(data_folder(task)), read_index(data_folder(task) / INDEX)
+def manifest(task: str) -> Manifest:
+    """The manifest of the zoo that ships for the task; raises UserError, with what to do, if none does."""
+    return Manifest.read(_shipped(task))
+
+
+def index(task: str, architecture: str | None = None) -> pa.Table:
+    """The index of the zoo that ships for the task, or one architecture's rows of it; raises UserError likewise."""
+    return read_index(_shipped(task) / INDEX, architecture)
+
+
+def _shipped(task: str) -> Path:
+    if task in tasks_with_zoo():
+        return data_folder(task)
+    if task in tasks.names():
+        raise UserError(f"{task} has no zoo yet; build it with: nnit-zoo build --task {task}")
+    raise unknown_name("zoo", task, tasks_with_zoo())
 
 
 def default_folder(task: str) -> Path:

@@ -47,7 +47,7 @@ def ghns_of(selection: Path) -> int:
 
 def describe(task: str) -> dict[str, Any]:
     """What there is to say of a zoo that ships: sizes, where it lies, how much of it is there, and its summary."""
-    manifest, index = places.shipped(task)
+    manifest, index = places.manifest(task), places.index(task)
     place = places.default_folder(task)
     ours = (place / MANIFEST).is_file() and Manifest.read(place) == manifest
     return {

@@ -253,7 +253,7 @@ def load(task: str, folder: Path | str | None = None, *, download: bool = False)
 def locate(task: str, folder: Path | None = None) -> Path:
     """The folder of the task's zoo, if its manifest is the expected one; raises UserError as `load` does."""
     place = places.default_folder(task) if folder is None else folder
-    release = places.shipped(task)[0] if folder is None else None
+    release = places.manifest(task) if folder is None else None
     if not (place / files.MANIFEST).is_file():
         raise UserError(f"no zoo of {task} in {place} yet; run: {places.download_command(task, place)}")
     manifest = files.Manifest.read(place)

@@ -259,7 +259,7 @@ def _dataset() -> tuple[Number | None, ...]:
     cells: list[Number | None] = []
     for task in ROBOT_TASKS:
         if task in places.tasks_with_zoo():
-            _, index = places.shipped(task)
+            index = places.index(task)
             seen = index.filter(pc.equal(index["split"], "seen"))
             for column, scale in ((RETURN, 1), (SUCCESS, 100)):
                 cells.append(Number(round(pc.mean(seen[column]).as_py() * scale, 1)))

@@ -197,7 +197,7 @@ def test_our_row_stands_under_the_papers(store: Store, pick: Protocol, capsys: p
 def test_the_papers_data_set_stands_over_the_mean_of_our_seen_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     columns = {"split": ["seen", "seen", "unseen"], "return": [40.0, 38.5, 0.0], "success_at_end": [1.0, 0.9, 0.0]}
     monkeypatch.setattr(paper.places, "tasks_with_zoo", lambda: ("PushCube-v1", "MNIST-PCA32"))
-    monkeypatch.setattr(paper.places, "shipped", lambda task: (None, pa.table(columns)))
+    monkeypatch.setattr(paper.places, "index", lambda task: pa.table(columns))
     (table,) = paper.main_table({})
     theirs, ours = table.rows[:2]
     assert (theirs.label, ours.label, ours.source) == ("Dataset, seen", "Dataset, seen", "here")
