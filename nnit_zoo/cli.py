@@ -20,7 +20,7 @@ app = App(
     default_parameter=Parameter(negative=""),
 )
 app.register_install_completion_command(help="Set up completion in your shell.")
-app.command("nnit_zoo.build.stages:build", name="build", help="Build a task's zoo: expert, GHNs, selection, manifest.")
+app.command("nnit_zoo.build.command:build", name="build", help="Build a task's zoo: expert, GHNs, selection, manifest.")
 
 Splits = Annotated[tuple[Literal["seen", "unseen", "excluded", "heldout_seed"], ...], SEVERAL]
 

@@ -139,8 +139,10 @@ class Builder(ABC):
         write_manifest(self.data, self.task.standardisation)
         seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]
         passed, kept = (sum(row[name] for row in seen) for name in ("passed", "kept"))
-        made = {stage: json.loads(self._made(stage).read_text()) for stage in ("ghns", "scores")}
-        self._record(**made)
+        record = json.loads((self.data / "task.json").read_text())
+        made = {stage: self._made(stage) for stage in self.stages}
+        record["build"] |= {stage: json.loads(path.read_text()) for stage, path in made.items() if path.exists()}
+        write_json(self.data / "task.json", record)
         log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass, {kept:,} are kept")
 
     @property
@@ -184,8 +186,3 @@ class Builder(ABC):
 
     def _scores(self, architecture: Architecture) -> Path:
         return self.work / "scores" / f"{architecture}.parquet"
-
-    def _record(self, **entries: dict[str, Any]) -> None:
-        content = json.loads((self.data / "task.json").read_text())
-        content["build"] |= entries
-        write_json(self.data / "task.json", content)

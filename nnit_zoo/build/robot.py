@@ -76,11 +76,12 @@ class RobotBuilder(Builder):
 
     def states(self) -> None:
         """Gather the shared buffer of states by DAgger."""
-        if (self._states).exists():
+        expert, done = self._expert(), self._states.exists()
+        self._sign("states", self.distill_config.model_dump(), works=not done)
+        if done:
             log("states: done")
-            return
-        distill.gather_states(self.task, self.distill_config, self._expert(), self.work / "states", self.workers, log)
-        self._record(states={**self.distill_config.model_dump(), "commit": str(commit())})
+        else:
+            distill.gather_states(self.task, self.distill_config, expert, self._states.parent, self.workers, log)
 
     def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
         """Regression onto the expert, on the buffer and on states of the GHN's own."""

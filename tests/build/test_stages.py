@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 import sys
 from pathlib import Path
 
@@ -17,18 +15,15 @@ import torch
 from nnit_zoo import files, places, stats, tasks
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.build import builder as common
-from nnit_zoo.build import distill, expert, mnist, robot, stages, twins
+from nnit_zoo.build import command, distill, expert, mnist, robot, twins
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.fit import Fit
 from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.cli import main
 from nnit_zoo.errors import UserError
-from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import materialise
 from nnit_zoo.places import data_folder
-from nnit_zoo.sim.control import Controller
-from nnit_zoo.sim.rollout import rollout
 from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
 from nnit_zoo.verify import rescore
@@ -123,7 +118,7 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
     record = json.loads((data_folder("PickCube-v1") / "task.json").read_text())
     assert record["build"]["expert"]["config"]["hidden"] == 16
     assert record["build"]["ghns"]["states"] == 2 * 2 * 50
-    assert record["build"]["states"]["rounds"] == 2 and record["build"]["states"]["commit"]
+    assert record["build"]["states"]["rounds"] == 2 and record["build"]["states"]["commits"]
 
 
 def test_a_killed_build_of_mnist_ends_with_the_same_bytes_and_a_zoo_with_accuracies(builder, tmp_path, monkeypatch):
@@ -167,8 +162,8 @@ def test_networks_for_digits_are_scored_where_the_user_says(builder, tmp_path, m
     monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
     builder(tmp_path, "MNIST-PCA32")  # gives the command below the toy's folder and architectures
     options = {"task": "MNIST-PCA32", "seeds": 1, "work": tmp_path}
-    stages.build(stage="ghns", workers=1, **options)
-    stages.build(stage="scores", workers=3, parallel="ray", **options)
+    command.build(stage="ghns", workers=1, **options)
+    command.build(stage="scores", workers=3, parallel="ray", **options)
     assert asked == [(3, "ray")] * 4
 
 
@@ -251,18 +246,6 @@ def test_twins_learn_the_same_from_seeds_of_their_own_and_go_on_after_a_kill(bui
         assert set(stats.PAPER_TWINS["PickCube-v1"]) <= set(measures)
 
 
-def test_a_wide_canvas_is_made_by_more_blocks_and_fills_wide_layers():
-    ghn = GHN(42, 8, seed=0, widths=(256,), layers=4)
-    wide = ghn.emit(Architecture(42, (256, 256, 256), 8))
-    assert ghn.canvas == 256 and [tuple(layer.shape[1:]) for layer in wide.layers][1] == (256, 257)
-    raw = wide.layers[1][0, :, :-1] * 256**0.5
-    assert raw.std() == pytest.approx(0.6, rel=0.2) and (raw.std(0) > 0.01).all()
-    assert {f"up{number}.weight" for number in range(1, 6)} <= set(ghn.state_dict())
-    assert "up4.weight" not in GHN(42, 8, seed=0).state_dict()
-    with pytest.raises(UserError, match="up to 64 wide, not 65 inputs"):
-        GHN(65, 8, seed=0)
-
-
 def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_path, monkeypatch):
     monkeypatch.setattr(files, "HELDOUT_SEEDS_FROM", 1)
     monkeypatch.setattr(robot.RobotBuilder, "yardstick_episodes", 1)
@@ -291,26 +274,6 @@ def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_
     rescored = rescore(tmp_path / "zoo", 9, episodes.append)
     assert all(row["agrees"] and row["now_return"] == row["stored_return"] for row in rescored)
     assert sum(episodes) == len(rescored) == 6  # of seed 1, and seed 0's of the other two architectures
-
-
-def test_a_worker_that_dies_costs_the_buffer_nothing(tmp_path):
-    class Deadly(PickCube):  # here, so that worker processes get it whole
-        episode_steps = 2
-
-        def start(self, seed):
-            if (tmp_path / "deadly").exists():
-                (tmp_path / "deadly").unlink()
-                os.kill(os.getpid(), signal.SIGKILL)
-            return super().start(seed)
-
-    config = DistillConfig(rounds=2, episodes_per_round=51, round_steps=2)
-    network = expert.network_of(expert.ActorCritic(42, 8, 16, -0.5).actor)
-    distill.gather_states(Deadly(), config, network, tmp_path / "alone", 1, print)
-    (tmp_path / "deadly").touch()
-    distill.gather_states(Deadly(), config, network, tmp_path / "killed", 2, print)
-    assert not (tmp_path / "deadly").exists()
-    whole, killed = (tmp_path / name / "states.safetensors" for name in ("alone", "killed"))
-    assert killed.read_bytes() == whole.read_bytes()
 
 
 def test_scores_of_other_ghns_are_made_again(builder, tmp_path):
@@ -350,7 +313,7 @@ def test_a_zoo_is_in_place_until_another_is_whole_and_not_replaced_by_a_smaller_
     assert artifacts(tmp_path) == before
     monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
     with pytest.raises(UserError, match="was made by 2 GHNs, and one of 1 would replace it"):
-        stages.build(task="MNIST-PCA32", seeds=1, work=tmp_path)
+        command.build(task="MNIST-PCA32", seeds=1, work=tmp_path)
 
 
 def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
@@ -363,78 +326,6 @@ def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
     more.scores()
     more.pack()
     assert set(pq.read_table(data_folder("MNIST-PCA32") / "scores.parquet")["ghn_seed"].to_pylist()) == {0, 1, 2}
-
-
-class Short(PickCube):
-    episode_steps = 3
-
-
-def toy_network():
-    torch.manual_seed(0)
-    network = expert.network_of(expert.ActorCritic(42, 8, 16, -0.5).actor)
-    return [(weight * (30 if number == 3 else 1), bias) for number, (weight, bias) in enumerate(network)]
-
-
-def test_teacher_and_students_act_as_often_as_they_should():
-    task, network, seeds = Short(), toy_network(), range(2)
-    student = [layer[0].numpy() for layer in GHN(42, 8, seed=0).emit(Architecture(42, (16, 16, 16, 16), 8)).layers]
-    students = dict.fromkeys(seeds, student)
-    controller = Controller([student] * 2, task.observation_mean, task.observation_std)
-    teachers, theirs = expert.play(task, network, seeds), rollout(task, seeds, controller)
-    for beta, episodes in ((1, teachers), (0, theirs)):
-        states = distill.collect(task, network, students, beta, 0, seeds)
-        np.testing.assert_array_equal(states, episodes.observations[:-1].reshape(-1, 42))
-    assert not np.array_equal(teachers.observations, theirs.observations)
-
-
-def test_the_expert_labels_raw_observations_and_students_see_standardised_ones():
-    task, network = PickCube(), toy_network()
-    raw = np.random.default_rng(0).normal(size=(5, 42)).astype(np.float32)
-    inputs, labels = distill.labelled(task, network, raw)
-    np.testing.assert_allclose(labels, expert.mean_action(network, raw).clip(-1, 1), rtol=1e-6)
-    np.testing.assert_allclose(inputs.numpy() * task.observation_std + task.observation_mean, raw, atol=1e-5)
-
-
-def test_no_ghn_and_no_round_plays_the_episodes_of_another(tmp_path, monkeypatch):
-    played = []
-
-    def note(task, fit, seeds):
-        played.extend(seeds)
-        return np.zeros((8, 42), np.float32)
-
-    monkeypatch.setattr(distill, "_own_states", note)
-    distill._save_states(tmp_path / "states", np.zeros((8, 42), np.float32))
-    for seed in (0, 1):
-        distill.train_ghn(PickCube(), TINY_DISTILL, toy_network(), tmp_path / "states", tmp_path / str(seed), seed)
-    assert len(played) == len(set(played)) == 2 * TINY_DISTILL.own_rounds * TINY_DISTILL.own_episodes
-
-
-def test_the_best_expert_is_kept_and_not_the_last(tmp_path, monkeypatch):
-    scores = iter([1.0, 3.0, 2.0])
-    best = {"success_once": 0.0, "success_at_end": 0.0, "episodes": 2}
-    monkeypatch.setattr(expert, "EVALUATION_SEEDS", range(1))
-    monkeypatch.setattr(expert, "summarise", lambda episodes: {"return": next(scores), **best})
-    networks = []
-    monkeypatch.setattr(expert, "save", lambda network, path: networks.append(network))
-    record = expert.train(PickCube(), TINY_EXPERT.model_copy(update={"total_steps": 300}), tmp_path, 1, print)
-    assert (record["return"], record["steps"], len(networks)) == (3, 200, 2)
-    assert json.loads((tmp_path / "record.json").read_text()) == record
-
-
-def test_weight_noise_is_relative_to_each_block():
-    fit = Fit(GHN(42, 8, 0), TINY_DISTILL, seed=0)
-    block = 3 * torch.ones(50, 100)
-    assert (fit.noisy(block) - block).std() == pytest.approx(3 * TINY_DISTILL.weight_noise, rel=0.05)
-
-
-def test_advantages_follow_their_definition():
-    draws = torch.Generator().manual_seed(0)
-    rewards, values = torch.rand((5, 2), generator=draws), torch.rand((6, 2), generator=draws)
-    ours = expert.generalised_advantages(rewards, values, 0.9, 0.8)
-    deltas = rewards + 0.9 * values[1:] - values[:-1]
-    for start in range(5):
-        sums = sum((0.9 * 0.8) ** later * deltas[start + later] for later in range(5 - start))
-        torch.testing.assert_close(ours[start], sums)
 
 
 def test_the_scores_of_a_candidate_do_not_depend_on_which_stage_run_made_them(builder, tmp_path):
