@@ -66,6 +66,12 @@ class Download:
         """Of the wanted files, those that the folder lacks or holds in another form."""
         return self.manifest.missing(self.folder, self.wanted(splits))
 
+    def ensure(self, screen: Display) -> None:
+        """`run`, with a note of what happens, unless this version of the zoo is there."""
+        if not self.is_there:
+            screen.note(f"{self._verb} the zoo of {self.task} in {self.folder}, as nnit-zoo download does")
+            self.run(screen)
+
     def run(self, screen: Display, splits: Collection[str] = SPLITS) -> None:
         """Write what is missing, as `files.fill` does, and show how far it is."""
         shards = len(files.shards_of(self._index, splits))

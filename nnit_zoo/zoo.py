@@ -244,9 +244,7 @@ def load(task: str, folder: Path | str | None = None, *, download: bool = False)
     """
     place = None if folder is None else Path(folder)
     if download and (place is None or not (place / files.MANIFEST).is_file()):
-        wanted = Download(task, place)
-        if not wanted.is_there:
-            wanted.run(Display(quiet=False))
+        Download(task, place).ensure(Display(quiet=False))
     return Zoo.open(locate(task, place))
 
 

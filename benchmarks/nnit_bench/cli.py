@@ -101,19 +101,15 @@ def run(
     tasks = [_task(name, sim) for name in task]
     protocols = {each: [protocol_of(each, name) for name in split] for each in tasks}
     zoos = {each: _zoo(each.name, screen) for each in tasks}
-    results, errors = [], []
+    results: list[tables.Results] = []
+    errors: list[str] = []
     for scored, zoo in zoos.items():
         for wanted in protocols[scored]:
-            outcomes = []
+            outcomes: list[runner.Outcome] = []
             for name in method:
-                try:
+                with _noted(errors, f"{name} on {wanted.task}, {wanted.split}"):
                     entry = runner.enter(name, zoo, wanted, checkpoint=checkpoint, sampling_steps=sampling_steps)
                     outcomes.append(runner.run(scored, zoo, entry, wanted, execution, screen.stage))
-                except UserError as error:  # the others' work should not be lost to it
-                    errors.append(f"{name} on {wanted.task}, {wanted.split}: {error}")
-                except Exception as error:  # nor to a crash, whose place its author needs
-                    traceback.print_exc()
-                    errors.append(f"{name} on {wanted.task}, {wanted.split}: {type(error).__name__}: {error}")
             results.append(tables.Results(wanted, outcomes, runner.zoo_row(zoo.index, wanted)))
     if as_json:
         print_json({"tables": [tables.plain(each) for each in results], "errors": errors})
@@ -250,6 +246,18 @@ def main() -> None:
 
 
 @contextmanager
+def _noted(errors: list[str], what: str) -> Iterator[None]:
+    """Note an error instead of stopping at it: other methods' work should not be lost to it."""
+    try:
+        yield
+    except UserError as error:
+        errors.append(f"{what}: {error}")
+    except Exception as error:  # a crash, whose place the method's author needs
+        traceback.print_exc()
+        errors.append(f"{what}: {type(error).__name__}: {error}")
+
+
+@contextmanager
 def _tracking(project: str | None, name: str) -> Iterator[Callable[[dict[str, float]], None] | None]:
     """What takes a line of a training's log to the run `name` of a trackio project, which goes on if it is there."""
     if project is None:
@@ -283,10 +291,7 @@ def _zoo(task: str, screen: Display) -> Zoo:
     import nnit_zoo
     from nnit_zoo.download import Download
 
-    zoo = Download(task)
-    if not zoo.is_there:
-        screen.note(f"making the zoo of {task} in {zoo.folder}, as nnit-zoo download does")
-        zoo.run(screen)
+    Download(task).ensure(screen)
     return nnit_zoo.load(task)
 
 
