@@ -20,7 +20,16 @@ app = App(
     default_parameter=Parameter(negative=""),
 )
 app.register_install_completion_command(help="Set up completion in your shell.")
-app.command("nnit_zoo.build.command:build", name="build", help="Build a task's zoo: expert, GHNs, selection, manifest.")
+app.command(
+    "nnit_zoo.build.command:build",
+    name="build",
+    help="""Build a task's zoo: what its GHNs learn from, a GHN per seed, every candidate's scores, and those that pass.
+
+    The last stage, pack, puts the zoo into the package, in place of the one that is there. Run the command again after
+    a kill, at any moment, and it goes on. With --stage, only that stage. The stage twins is not part of all: it makes
+    nothing for the zoo, but NNiT's comparison of networks from GHNs with others, for stats.
+    """,
+)
 
 Splits = Annotated[tuple[Literal["seen", "unseen", "excluded", "heldout_seed"], ...], SEVERAL]
 

@@ -13,6 +13,8 @@ tags:
 ---
 # {name} for {task}
 
+{description}
+
 Generates the weights of small {task} policies, of a requested architecture. Trained on the policies of seen
 architectures and training seeds of the `nnit` zoo.
 
@@ -35,8 +37,10 @@ To score it: `nnit-bench run --method {method} --task {task} --checkpoint FOLDER
 """
 
 
-def card(name: str, method: str, task: str, training: Mapping[str, Any], licence: str | None) -> str:
+def card(
+    name: str, method: str, task: str, *, description: str, training: Mapping[str, Any], licence: str | None
+) -> str:
     """The card of a checkpoint of the class `name`, which is found as `method`, for `task`."""
     facts = "\n".join(f"| {key.replace('_', ' ')} | {value} |" for key, value in training.items())
     line = f"license: {licence}\n" if licence else ""
-    return CARD.format(name=name, method=method, task=task, facts=facts, licence=line)
+    return CARD.format(name=name, method=method, task=task, description=description, facts=facts, licence=line)

@@ -92,6 +92,11 @@ class Generator(ABC):
     sampling_steps: int | None = None
     """In how many steps it samples; None for a method without such steps. `nnit-bench run --sampling-steps` sets it."""
 
+    @property
+    def description(self) -> str:
+        """What its model card says of it: by default the first line of its class's documentation."""
+        return (type(self).__doc__ or "").partition("\n")[0]
+
     @classmethod
     def from_preset(cls, name: str) -> Self:
         """A generator with the named settings, not yet fitted; raises UserError if there are none of that name."""
@@ -152,7 +157,14 @@ class Generator(ABC):
         config, tensors = config | own, self.tensors()
         write_atomically(folder / WEIGHTS, lambda path: safetensors.torch.save_file(tensors, path, METADATA))
         write_json(folder / CONFIG, config)
-        text = card(kind.__name__, address(kind), self.task, self.training_facts, self.licence)
+        text = card(
+            kind.__name__,
+            address(kind),
+            self.task,
+            description=self.description,
+            training=self.training_facts,
+            licence=self.licence,
+        )
         write_bytes(folder / CARD, text.encode())
 
     @classmethod

@@ -51,9 +51,7 @@ class Verdict:
 
 
 def check(*, method: str, as_json: Json = False) -> None:
-    """Say whether a method keeps to the contract of a generator, on a tiny synthetic zoo and without a simulator.
-
-    Exit code 1 means that it does not.
+    """Say whether a method keeps to the contract of a generator; exit code 1 means that it does not.
 
     Args:
         method: Name, package.module:Class or path/to/file.py:Class of a generator.

@@ -31,10 +31,32 @@ app = App(
     default_parameter=Parameter(negative=""),
 )
 app.register_install_completion_command(help="Set up completion in your shell.")
-app.command("nnit_bench.compare:compare", name="compare", help="Say whether two methods can be told apart.")
-app.command("nnit_bench.check:check", name="check", help="Say whether a method keeps to the contract of a generator.")
-app.command("nnit_bench.report:report", name="report", help="Write all stored results as tables and figures.")
-app.command("nnit_bench.paper:reproduce", name="reproduce", help="Print a table of the paper with our rows in it.")
+app.command(
+    "nnit_bench.compare:compare",
+    name="compare",
+    help="Say whether two methods can be told apart, pairing their architectures and episodes.",
+)
+app.command(
+    "nnit_bench.check:check",
+    name="check",
+    help="""Say whether a method keeps to the contract of a generator, on a tiny synthetic zoo, without a simulator.
+
+    Exit code 1 means that it does not.
+    """,
+)
+app.command(
+    "nnit_bench.report:report",
+    name="report",
+    help="""Write all stored results as tables and figures: of every method its newest whole run on each task and split.
+
+    Runs that ship with the project are among them, and marked.
+    """,
+)
+app.command(
+    "nnit_bench.paper:reproduce",
+    name="reproduce",
+    help="Print a table of the paper with our row under each of its rows, from stored runs.",
+)
 
 
 DEFAULT_EXECUTION = Execution()

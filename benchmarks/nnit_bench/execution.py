@@ -22,4 +22,4 @@ class Execution:
     output: Path = Path("results")
     """Folder of the result files."""
     overwrite: Overwrite = "missing"
-    """Whether to do what has been done: missing finishes what is unfinished, never leaves it, always repeats all."""
+    """What is done for a run that is there unfinished: missing finishes it, never fails; always repeats any run."""

@@ -178,7 +178,7 @@ def policies_per_architecture(split: str, each: int | None = None, only: Sequenc
 def _not_in_split(name: str, split: str, listed: Sequence[str]) -> UserError:
     other = next((each for each in SPLITS if name in architectures(each)), None)
     if other:
-        return UserError(f"architecture {name} is not {split} but {other}: add --split {other}")
+        return UserError(f"architecture {name} is not {split} but {other}: use --split {other}")
     if split == "joint":
         return UserError("on the split joint the generator chooses the architectures: leave --architecture out")
     return unknown_name("architecture", name, listed)

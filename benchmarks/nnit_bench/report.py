@@ -7,6 +7,7 @@ import io
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,9 +30,7 @@ Group = list[StoredRun]
 
 
 def report(*, folders: Folders = FOLDERS, output: Path = Path("report"), as_json: Json = False) -> None:
-    """Write all stored results as tables and figures: of every method its newest whole run on each task and split.
-
-    Runs that ship with the project are among them, and marked.
+    """Write all stored results as tables, and as figures if matplotlib is installed.
 
     Args:
         folders: Folders to look for runs in; may be repeated.
@@ -43,7 +42,9 @@ def report(*, folders: Folders = FOLDERS, output: Path = Path("report"), as_json
         raise UserError(f"no finished runs in {', '.join(map(str, folders))}; make one with: nnit-bench run")
     groups = _grouped(runs)
     content = json.dumps([_plain(run) for group in groups for run in group], indent=2) + "\n"
-    figures = dict(_figures(groups))
+    figures = dict(_figures(groups)) if find_spec("matplotlib") else {}
+    if not figures:
+        sys.stderr.write("tables only: figures need matplotlib; run: pip install 'nnit[figures]'\n")
     write_bytes(output / "report.json", content.encode())
     write_bytes(output / "report.csv", _csv(groups).encode())
     write_bytes(output / "report.md", _markdown(groups, figures).encode())
@@ -166,10 +167,6 @@ def _figure_names(group: Group) -> tuple[str, str]:
 
 
 def _figures(groups: Sequence[Group]) -> Iterator[tuple[str, Figure]]:
-    try:
-        import matplotlib  # noqa: F401, PLC0415  an optional extra
-    except ImportError:
-        raise UserError("figures need matplotlib; run: pip install 'nnit[figures]'") from None
     for group in groups:
         scored = [run for run in group if run.record.results]
         if scored:

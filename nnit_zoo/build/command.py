@@ -40,10 +40,6 @@ def build(
 ) -> None:
     """Build a task's zoo: what its GHNs learn from, one GHN per seed, every candidate's scores, and those that pass.
 
-    The last stage, `pack`, puts the zoo into the package, in place of the one that is there. Run the command again
-    after a kill, at any moment, and it goes on. With `--stage`, only that stage. The stage `twins` is not part of
-    `all`: it makes nothing for the zoo, but NNiT's comparison of networks from GHNs with others, for `stats`.
-
     Args:
         task: Name of the task.
         stage: Only this stage, of those that the task has.

@@ -193,7 +193,7 @@ def test_options_reach_the_work(
         (["--task", "PickCub-v1"], "no task named 'PickCub-v1': did you mean PickCube-v1"),
         (["--method", "nit"], "no method named 'nit': did you mean nnit"),
         (["--architecture", "32-32-16-46"], "no architecture named '32-32-16-46': did you mean"),
-        (["--architecture", "64-64-64-64"], "add --split seen"),
+        (["--architecture", "64-64-64-64"], "use --split seen"),
         (["--split", "unseeen"], "no split named 'unseeen': did you mean unseen"),
         (["--method", "nnit,crop", "--checkpoint", "folder"], "--checkpoint belongs to one --method"),
         (["--episodes", "0"], "is scored on 1 to"),

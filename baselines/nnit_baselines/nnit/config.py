@@ -113,3 +113,9 @@ def preset(name: str) -> NNiTConfig:
     if name not in PRESETS:
         raise unknown_name("preset of nnit", name, PRESETS)
     return PRESETS[name]
+
+
+def preset_name(settings: NNiTConfig) -> str | None:
+    """The preset with these settings, whatever the number of steps; None if there is none."""
+    steps = {"steps": settings.steps}
+    return next((name for name, each in PRESETS.items() if each.model_copy(update=steps) == settings), None)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nnit_baselines.generator import Capabilities, FitOptions, Generator, SampleRequest, refuse_reference
 from nnit_baselines.nnit import training
-from nnit_baselines.nnit.config import NNiTConfig, preset
+from nnit_baselines.nnit.config import NNiTConfig, preset, preset_name
 from nnit_baselines.nnit.form import Form
 from nnit_baselines.nnit.mixture import Mixture, Packed, PackedMixture, PaddedMixture
 from nnit_baselines.nnit.model import Transformer
@@ -33,6 +33,14 @@ class NNiT(Generator):
         self.form: Form
         self.model: Transformer
 
+    @property
+    def description(self) -> str:
+        """What it is, and how far it is the paper's."""
+        settings = f"preset {preset_name(self.settings) or 'none'}"
+        predicts = "clean weights, not the noise as in the paper" if self.settings.objective == "clean" else "the noise"
+        joint = "can" if self.settings.joint else "cannot"
+        return f"{super().description} Its settings: {settings}; predicts {predicts}; {joint} choose architectures."
+
     @classmethod
     def from_preset(cls, name: str) -> Self:
         """An NNiT with the settings `cpu` (ours, the default) or `paper`; raises UserError for another name."""
@@ -53,7 +61,9 @@ class NNiT(Generator):
             torch.manual_seed(options.seed)  # only the initial weights; a step's batch has a generator of its own
             self._take(Form.of(view, fan_in_scaling=self.settings.fan_in_scaling))
         data = [Packed.of(view.batch(each), self.form, self.settings) for each in view.architectures]
-        self.training_facts = training.train(self.model, data, self.mixture, options)
+        facts = training.train(self.model, data, self.mixture, options)
+        settings = preset_name(self.settings)
+        self.training_facts = {**({"preset": settings} if settings else {}), **facts}
         self._restore(self.tensors())
 
     def sample(self, request: SampleRequest) -> PolicyBatch:
