@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import importlib.util
 import inspect
@@ -130,7 +131,8 @@ def address(kind: type[Generator]) -> str:
 
 
 def _run_file(path: Path) -> Any:
-    spec = importlib.util.spec_from_file_location(f"{FILE_MODULE}{path.stem}", path)
+    place = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:8]  # files of one name are modules of two
+    spec = importlib.util.spec_from_file_location(f"{FILE_MODULE}{path.stem}_{place}", path)
     if spec is None or spec.loader is None or not path.is_file():
         raise UserError(f"no such file: {path}")
     module = importlib.util.module_from_spec(spec)

@@ -210,9 +210,7 @@ def _gives(subject: Subject) -> None:
 def _repeats(subject: Subject) -> None:
     for name, ask in subject.ways().items():
         first = ask(3, 7)
-        torch.manual_seed(12345)  # where a careless method gets its random numbers
-        random.seed(12345)
-        np.random.seed(12345)  # noqa: NPY002
+        _scramble()
         if not _equal(first, ask(3, 7)):
             raise Broken(
                 f"two calls of {name} with one seed gave different networks; "
@@ -257,6 +255,17 @@ def _leaves_alone(subject: Subject) -> None:
             raise Broken(f"{culprit} changed the view's policies in place; work on a copy")
         if _global_state() != state:
             raise Broken(f"{culprit} used the global random numbers; use a generator, or torch.random.fork_rng()")
+
+
+@clause("Fitted again with the same seed, it gives the same networks.")
+def _fits_alike(subject: Subject) -> None:
+    again = subject.kind()
+    _scramble()
+    again.fit(subject.view, FitOptions(steps=STEPS))
+    others = subject.ways(again)
+    for name, ask in subject.ways().items():
+        if not _equal(ask(3, 7), others[name](3, 7)):
+            raise Broken("two fits with one seed gave different generators; draw from options.seed alone")
 
 
 @clause("It makes the architectures that it declares, and answers any other with a UserError.")
@@ -311,6 +320,13 @@ def _problem(clause: Clause, subject: Subject) -> str | None:
         last = (own or frames)[-1]  # in the method's file, if it got there, and not in a library that it calls
         return f"{type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno})"
     return None
+
+
+def _scramble() -> None:
+    """Reset the global random numbers, from which a careless method draws."""
+    torch.manual_seed(12345)
+    random.seed(12345)
+    np.random.seed(12345)  # noqa: NPY002
 
 
 def _check_batch(name: str, batch: PolicyBatch) -> None:

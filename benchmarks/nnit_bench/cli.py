@@ -172,6 +172,8 @@ def train(
     from nnit_zoo import tasks
     from nnit_zoo.display import Display
 
+    if steps is not None and steps < 1:
+        raise UserError(f"--steps must be 1 or more, not {steps}")
     task = tasks.get(task).name
     registry.get(method)
     folder = output or Path("runs") / folder_name(method) / task

@@ -23,6 +23,10 @@ from nnit_zoo.tasks.metric import Metric
 NAMES = {"mean": "mean", "top": "top", "top_heldout": "held out"}
 
 
+class Incomparable(UserError):
+    """Two runs were not measured alike, or have nothing in common."""
+
+
 @dataclass(frozen=True)
 class Difference:
     """How much higher one method scores than another, over the same architectures and episodes."""
@@ -74,12 +78,12 @@ def differ(first: StoredRun, second: StoredRun) -> list[Difference]:
     """The differences of two runs' scores, over the architectures and episodes that both have.
 
     Of `mean`, architectures with their policies are drawn for both methods together, and so are episodes; on `joint`
-    each method's policies are drawn for themselves. Of the `top` ones, which are given, only episodes. Raises UserError
-    if they were not measured alike, or share no architecture or episode.
+    each method's policies are drawn for themselves. Of the `top` ones, which are given, only episodes. Raises
+    Incomparable if they were not measured alike, or share no architecture or episode.
     """
     ours, theirs = first.record.protocol, second.record.protocol
     if not ours.measures_like(theirs):
-        raise UserError(f"{_what(ours)} and {_what(theirs)} are not measured alike and cannot be compared")
+        raise Incomparable(f"{_what(ours)} and {_what(theirs)} are not measured alike and cannot be compared")
     parts = {"mean": _paired([scores.everything(run.episodes, run.record.protocol) for run in (first, second)], ours)}
     for name, both in _picked(first, second).items():
         parts[name] = _same_episodes(both)
@@ -92,15 +96,23 @@ def differ(first: StoredRun, second: StoredRun) -> list[Difference]:
     return found
 
 
+def tied(first: StoredRun, second: StoredRun) -> bool:
+    """Whether two runs can be compared, and not be told apart in their mean headline score."""
+    try:
+        return not differ(first, second)[0].separable
+    except Incomparable:
+        return False
+
+
 def _paired(both: Sequence[Scores], protocol: Protocol) -> tuple[Scores, Scores]:
-    """The scores on the architectures and episodes that both have; raises UserError if there are none."""
+    """The scores on the architectures and episodes that both have; raises Incomparable if there are none."""
     if not protocol.is_joint:
         shared = set(both[0].architectures.tolist()) & set(both[1].architectures.tolist())
         if not shared:
-            raise UserError("the two runs have no architecture in common")
+            raise Incomparable("the two runs have no architecture in common")
         both = [each.of(each.policies[np.isin(each.architectures, sorted(shared))]) for each in both]
     if not set(both[0].seeds.tolist()) & set(both[1].seeds.tolist()):
-        raise UserError("the two runs have no episode in common")
+        raise Incomparable("the two runs have no episode in common")
     return _same_episodes(both)
 
 
@@ -162,6 +174,8 @@ def in_words(first: str, second: str, difference: Difference, metric: Metric) ->
     """What a difference of means says, as a sentence."""
     unit = " points" if metric.unit == "%" else ""
     value, interval = difference.difference.text(metric.scale, signed=True)
+    if not interval and difference.first == difference.second:
+        return f"{first} and {second} do the same in every episode: nothing tells them apart in mean {metric.label}."
     if not difference.separable:
         return (
             f"{first} and {second} cannot be told apart in mean {metric.label}: "

@@ -10,13 +10,14 @@ import re
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distributions, version
 from importlib.util import find_spec
 from modulefinder import ModuleFinder
 from pathlib import Path
 
+from nnit_zoo.errors import UserError
 from nnit_zoo.files import sha256_of
 from nnit_zoo.provenance import commit
 
@@ -75,7 +76,8 @@ def hash_files(files: Mapping[str, Path]) -> str:
 def plugin_files(module: str) -> dict[str, Path]:
     """Name -> source file of what a method in this loaded module is made of.
 
-    A package is all its files; a single file is itself and what it imports from beside it.
+    A package is all its files; a single file is itself and what it imports from beside it. Raises UserError if another
+    method's module was loaded in place of one of these.
     """
     top = sys.modules[module.partition(".")[0]]
     if hasattr(top, "__path__"):
@@ -86,13 +88,26 @@ def plugin_files(module: str) -> dict[str, Path]:
         return {file.name: file}
     finder = ModuleFinder([str(file.parent)], excludes=OUR_PACKAGES)
     finder.run_script(str(file))
-    found = [Path(each) for module in finder.modules.values() if (each := vars(module)["__file__"])]
-    return {str(path.relative_to(file.parent)): path for path in found}
+    found = {name: Path(each) for name, module in finder.modules.items() if (each := vars(module)["__file__"])}
+    for name, path in found.items():
+        loaded = getattr(sys.modules.get(name), "__file__", None)
+        if name != "__main__" and loaded is not None and Path(loaded).resolve() != path.resolve():
+            raise UserError(f"{file} needs {path}, but {loaded} of that name is loaded; use a command for each of them")
+    return {str(path.relative_to(file.parent)): path for path in found.values()}
 
 
 def this_code(plugin: str | None = None) -> Code:
     """The code that is running, with the module of a method that is not one of ours."""
-    files = {} if plugin is None else {f"method/{name}": path for name, path in plugin_files(plugin).items()}
+    ours = _our_code()
+    if plugin is None:
+        return ours
+    total = hashlib.sha256(f"{ours.sha256} {hash_files(plugin_files(plugin))}".encode())
+    return replace(ours, sha256=total.hexdigest())
+
+
+@cache  # what was loaded: files that change while a command runs are not what runs
+def _our_code() -> Code:
+    files: dict[str, Path] = {}
     for package in OUR_PACKAGES:
         spec = find_spec(package)
         assert spec is not None and spec.origin is not None

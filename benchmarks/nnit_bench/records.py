@@ -72,6 +72,8 @@ class Method(_Strict):
     """Numbers in its checkpoint."""
     checkpoint_sha256: str | None
     """Of the checkpoint's model.safetensors; null for a generator that is fitted at every run."""
+    oracle: bool = False
+    """Fitted on the reference policies of the evaluated split: an upper bound, not a method."""
 
     @property
     def label(self) -> str:
@@ -175,6 +177,8 @@ class RunRecord(_Strict):
     packages: dict[str, str]
     """Name and version of everything installed."""
     hardware: Hardware
+    resumed: bool = False
+    """Whether it was interrupted: `timings` are then of what was left to do."""
     timings: Timings | None = None
     results: Summary | None = None
     """Computed from the episodes."""

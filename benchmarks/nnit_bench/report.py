@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nnit_bench import paper, results, scores
-from nnit_bench.compare import differ
+from nnit_bench.compare import tied
 from nnit_bench.protocol import SPLITS
 from nnit_bench.results import FOLDERS, Folders, StoredRun
 from nnit_bench.statistics import Estimate
@@ -106,12 +106,13 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
         metric = protocol.metrics[0]
         parts.append(f"## {protocol.task}, {protocol.split}\n")
         parts.append(
-            f"Headline: {metric.heading}, with 95 % intervals. `tied`: cannot be told "
-            "apart from the first row. `nearest known`: median distance (relative L2) to the nearest policy that a "
+            f"Headline: {metric.heading}, with 95 % intervals. `tied with`: cannot be "
+            "told apart from these. `nearest known`: median distance (relative L2) to the nearest policy that a "
             "known seed has for the architecture; in brackets as a multiple of that of held-out seeds. "
             "`shipped`: run by the project, not here.\n"
         )
-        heading = ["method", "mean", f"top-{protocol.top}", "held out", "worst architecture", "tied", "nearest known"]
+        best = f"top-{protocol.top}"
+        heading = ["method", "mean", best, "held out", "worst architecture", "tied with", "nearest known"]
         parts.append("| " + " | ".join(heading) + " |\n|---|" + "---:|" * (len(heading) - 1))
         parts += [_row(run, group, metric) for run in group]
         parts.append("")
@@ -128,20 +129,19 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
 
 def _row(run: StoredRun, group: Group, metric: Metric) -> str:
     record = run.record
-    name = record.method.label + _size(run, group) + ", shipped" * run.is_shipped
+    marks = [*run.departures, "upper bound" * record.method.oracle, "shipped" * run.is_shipped]
+    name = ", ".join([record.method.label + _size(run, group), *filter(None, marks)])
     if record.results is None:
         return f"| {name} | {record.status}: {record.error} |" + " |" * 5
     numbers = record.results.estimates[metric.column]
     cells = [_cell(numbers.get(name), metric) for name in ("mean", "top", "top_heldout", "worst")]
     if record.results.worst:
         cells[-1] += f" {record.results.worst}"
-    first = group[0]
-    tied = run is not first and record.protocol.measures_like(first.record.protocol)
-    tied = tied and not differ(first, run)[0].separable
+    others = [each for each in group if each is not run and each.record.results and tied(run, each)]
     same = record.novelty and record.novelty.same_architecture
     ratio = "" if not same or same.ratio is None else f" ({same.ratio:.2f})"
     distance = f"{same.median:.1%}{ratio}" if same else "-"
-    return "| " + " | ".join([name, *cells, "tied" if tied else "", distance]) + " |"
+    return "| " + " | ".join([name, *cells, ", ".join(each.record.method.label for each in others), distance]) + " |"
 
 
 def _size(run: StoredRun, group: Group) -> str:

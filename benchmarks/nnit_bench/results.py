@@ -53,6 +53,18 @@ class StoredRun:
         protocol = self.record.protocol
         return protocol.policies == policies_per_architecture(protocol.split)
 
+    @property
+    def departures(self) -> tuple[str, ...]:
+        """Which of its settings are not the benchmark's, in words; numbers of policies and episodes apart."""
+        protocol, given = self.record.protocol, self.record.method.given
+        found = {
+            f"on {protocol.simulator}": protocol.simulator not in (None, "fast"),
+            f"seed {protocol.seed}": protocol.seed != 0,
+            f"{given.get('sampling_steps')} sampling steps": "sampling_steps" in given,
+            f"checkpoint {given.get('checkpoint')}": "checkpoint" in given,
+        }
+        return tuple(words for words, so in found.items() if so)
+
 
 def find(folders: Iterable[Path]) -> list[StoredRun]:
     """The finished runs below some folders, oldest first; a record that cannot be read is left out with a warning."""
@@ -69,10 +81,17 @@ def find(folders: Iterable[Path]) -> list[StoredRun]:
 
 
 def latest(runs: Iterable[StoredRun]) -> dict[tuple[str, str, str], StoredRun]:
-    """(task, split, method) -> its run: a whole one, of the most episodes, the newest, one's own, in this order."""
+    """(task, split, method) -> its run.
 
-    def rank(run: StoredRun) -> tuple[bool, int, datetime, bool]:
-        return run.is_whole, run.record.protocol.select.count, run.record.started, not run.is_shipped
+    In this order: a whole one, with the benchmark's settings (whatever its checkpoint), of the newest version of the
+    task, of the most episodes, the newest, one's own.
+    """
+
+    def rank(run: StoredRun) -> tuple[bool, bool, int, int, datetime, bool]:
+        protocol = run.record.protocol
+        usual = all(words.startswith("checkpoint") for words in run.departures)
+        newest = protocol.task_version, protocol.select.count, run.record.started
+        return run.is_whole, usual, *newest, not run.is_shipped
 
     ranked = sorted(runs, key=rank)
     return {(run.record.protocol.task, run.record.protocol.split, run.record.method.name): run for run in ranked}

@@ -18,11 +18,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from nnit_baselines import registry
-from nnit_baselines.generator import WEIGHTS, Generator, SampleRequest, check_batch
+from nnit_baselines.generator import WEIGHTS, Capabilities, Generator, SampleRequest, check_batch
 from nnit_bench import novelty, records, scores
 from nnit_bench.execution import Execution, Overwrite
 from nnit_bench.protocol import Protocol
-from nnit_bench.provenance import OUR_PACKAGES, numeric_packages, this_code
+from nnit_bench.provenance import OUR_PACKAGES, Code, numeric_packages, this_code
 from nnit_bench.records import Identity, Method, RunRecord, Timings, ZooVersion
 from nnit_bench.scores import Scores
 from nnit_bench.statistics import Estimate, Floats, Ints
@@ -44,8 +44,8 @@ class Entry:
     """A method's entry in a run: a generator that is ready to sample, and how it got there."""
 
     method: Method
-    plugin: str | None
-    """The module that a method which is not one of ours comes from."""
+    code: Code
+    """What was loaded to make it; later changes to the files do not count."""
     generator: Generator | None
     """None if it is of no use for what is asked."""
     unsupported: str | None
@@ -82,7 +82,7 @@ def enter(
     start = time.perf_counter()
     kind = registry.get(name)
     ours = kind.__module__.partition(".")[0] in OUR_PACKAGES
-    plugin = None if ours else kind.__module__
+    code = this_code(None if ours else kind.__module__)
     options = {"checkpoint": checkpoint, "sampling_steps": sampling_steps}
     given = {key: value for key, value in options.items() if value is not None}
     able = kind.capabilities
@@ -92,19 +92,18 @@ def enter(
     elif able.oracle and protocol.split not in SPLITS:
         reason = f"the zoo has no policies of the split {protocol.split}"
     if reason:
-        method = Method(name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None)
-        return Entry(method, plugin, None, reason, 0.0)
+        return Entry(_method(name, able, given), code, None, reason, 0.0)
     generator = registry.prepare(name, zoo, protocol.split, checkpoint, protocol.seed)
     if sampling_steps is not None:
         set_sampling_steps(name, generator, sampling_steps)
     method = describe(name, generator, given)
-    return Entry(method, plugin, generator, _lacks(generator, zoo, protocol), time.perf_counter() - start)
+    return Entry(method, code, generator, _lacks(generator, zoo, protocol), time.perf_counter() - start)
 
 
 def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
     """What identifies a generator; `given` is what the command set on top of its defaults."""
     if not generator.capabilities.checkpoint:
-        return Method(name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None)
+        return _method(name, generator.capabilities, given)
     with TemporaryDirectory() as folder:  # also a checkpoint from the Hub is identified by what it is, not by its name
         generator.save_pretrained(folder)
         sha256 = sha256_of(Path(folder) / WEIGHTS)
@@ -115,6 +114,14 @@ def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
         training=dict(generator.training_facts),
         parameters=sum(tensor.numel() for tensor in generator.tensors().values()),
         checkpoint_sha256=sha256,
+        oracle=generator.capabilities.oracle,
+    )
+
+
+def _method(name: str, able: Capabilities, given: dict[str, Any]) -> Method:
+    """A generator without a checkpoint."""
+    return Method(
+        name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None, oracle=able.oracle
     )
 
 
@@ -144,13 +151,12 @@ def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execu
     An interrupted run leaves a record with status `started` and its finished work; the same call goes on from there.
     Raises UserError if the method or the task cannot, after recording that.
     """
-    code = this_code(entry.plugin)
     sha256 = sha256_of(zoo.folder / MANIFEST)
     identity = Identity(
         protocol=protocol,
         method=entry.method,
         zoo_sha256=sha256,
-        code_sha256=code.sha256,
+        code_sha256=entry.code.sha256,
         packages=numeric_packages(),
     )
     folder = identity.folder(execution.output)
@@ -158,7 +164,7 @@ def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execu
         return earlier
     seen = zoo.index.filter(pc.equal(zoo.index["split"], "seen"))
     version = ZooVersion(sha256=sha256, policies=len(seen), seeds=len(pc.unique(seen["ghn_seed"])))
-    record = RunRecord.start(identity, version, code)
+    record = _begun(folder) or RunRecord.start(identity, version, entry.code)
     record.write(folder)
     if entry.unsupported:
         return Outcome(record.stop(folder, "unsupported", entry.unsupported), folder, reused=False, zeroed={})
@@ -184,6 +190,13 @@ def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:
     if overwrite == "never":
         raise UserError(f"the run in {folder} has not finished; --overwrite missing goes on with it")
     return None
+
+
+def _begun(folder: Path) -> RunRecord | None:
+    """The record of the interrupted run that is there, which has kept finished work, taken up again."""
+    if not ((folder / records.RECORD).is_file() and (folder / UNITS).is_dir()):
+        return None
+    return RunRecord.read(folder).model_copy(update={"status": "started", "error": None, "resumed": True})
 
 
 def _carry_out(

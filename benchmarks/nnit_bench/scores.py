@@ -171,21 +171,19 @@ def summarise(episodes: pa.Table, protocol: Protocol) -> Summary:
 def of_means(means: Scores, protocol: Protocol) -> tuple[dict[str, dict[str, Estimate]], str]:
     """`mean`, `worst` and `top` of policies that only have means over episodes, [policies, 1], and the worst's name.
 
-    The intervals allow for architectures and policies only.
+    The intervals allow for architectures and policies only; so `top`, which is of given policies, has none.
     """
     worst = worst_architecture(means, protocol.metrics)
-    parts = {
-        "mean": (means, means.architectures),
-        "worst": (means.of(means.policies[means.architectures == worst]), None),
-        "top": (means.of(ranked(means, protocol.metrics)[: protocol.top]), None),
-    }
-    estimates: dict[str, dict[str, Estimate]] = {
-        metric.column: {
-            name: mean(part.values[metric.column], together, np.random.default_rng(0))
-            for name, (part, together) in parts.items()
+    lowest = means.of(means.policies[means.architectures == worst])
+    best = means.of(ranked(means, protocol.metrics)[: protocol.top])
+    estimates: dict[str, dict[str, Estimate]] = {}
+    for metric in protocol.metrics:
+        top = float(best.values[metric.column].mean())
+        estimates[metric.column] = {
+            "mean": _estimate(means, metric, clusters(means, protocol)),
+            "worst": _estimate(lowest, metric),
+            "top": Estimate(top, top, top),
         }
-        for metric in protocol.metrics
-    }
     return estimates, worst
 
 

@@ -128,6 +128,8 @@ def _remarks(console: Console, outcome: Outcome) -> None:
     name = record.method.label
     if record.error:
         console.print(f"{name}: {record.error}")
+    if record.method.oracle and record.results:
+        console.print(f"{name}: an upper bound, for it was given the zoo's policies of these very architectures")
     for reason, count in outcome.zeroed.items():
         console.print(f"{name}: {count} policies scored 0: {reason}")
     joint = record.results and record.results.joint

@@ -322,3 +322,17 @@ def test_the_preset_paper_holds_the_paper_s_hyperparameters():
     assert (paper.learning_rate, paper.last_learning_rate, paper.warmup) == (7e-5, 3e-5, 500)
     assert (paper.clip, paper.ema, paper.batch, paper.steps) == (1.0, 0.9999, 16, 1300 * 6400 // 16)
     assert paper.joint and paper.padded
+
+
+def test_a_class_with_settings_of_its_own_comes_back_from_its_checkpoint(view, tmp_path):
+    generator = Narrow()
+    generator.fit(view, FitOptions(steps=1))
+    generator.save_pretrained(tmp_path)
+    back = Narrow.from_pretrained(tmp_path)
+    assert back.settings == generator.settings and back.settings.patch == 8
+    assert "preset none; predicts clean weights" in (tmp_path / "README.md").read_text()
+
+
+class Narrow(NNiT):
+    def __init__(self):
+        super().__init__(NNiTConfig(**SMALL | {"patch": 8}))

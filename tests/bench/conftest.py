@@ -223,7 +223,9 @@ def plugin(tmp_path: Path) -> Path:
     return path
 
 
-def store_run(folder: Path, name: str, protocol: Protocol, success: np.ndarray) -> StoredRun:
+def store_run(
+    folder: Path, name: str, protocol: Protocol, success: np.ndarray, zoo: str = "z", given: Any = None
+) -> StoredRun:
     """A finished run whose policies went as `success` [policies, episodes] says; those of `joint` are all alike."""
     names = [each for each, count in protocol.policies.items() for _ in range(count)]
     names = ["16-16-16-32" if protocol.is_joint else each for each in names]
@@ -235,11 +237,11 @@ def store_run(folder: Path, name: str, protocol: Protocol, success: np.ndarray) 
             row |= {"success_at_end": bool(value), "success_once": bool(value), "return": 40.0 * value}
         rows.append({"return": value} | {name: each for name, each in row.items() if each is not None})
     episodes = pa.Table.from_pylist(rows, records.STORED_EPISODE_SCHEMA)
-    method = Method(name=name, config={}, given={}, training={}, parameters=None, checkpoint_sha256=None)
-    identity = Identity(protocol=protocol, method=method, zoo_sha256="z", code_sha256="c", packages={})
+    method = Method(name=name, config={}, given=given or {}, training={}, parameters=None, checkpoint_sha256=None)
+    identity = Identity(protocol=protocol, method=method, zoo_sha256=zoo, code_sha256="c", packages={})
     code = Code(sha256="c", commit=None, dirty=None)
     place = identity.folder(folder)
-    record = RunRecord.start(identity, ZooVersion(sha256="z", policies=1, seeds=1), code)
+    record = RunRecord.start(identity, ZooVersion(sha256=zoo, policies=1, seeds=1), code)
     timings = records.Timings(load_or_fit=0, sample=0, novelty=0, score=0)
     novelty = records.Novelty(
         same_architecture=records.Distance(median=0.02, heldout=1.2, ratio=0.02 / 1.2),

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 
@@ -151,6 +152,12 @@ class NotABatch(Good):
         return super().sample(request).layers
 
 
+class FitsAtRandom(Good):
+    def fit(self, view, options=None):
+        super().fit(view, options)
+        self.scale = float(np.random.default_rng().normal())
+
+
 class GlobalDraws(Good):
     def fresh(self, architecture, policies, generator):
         return super().fresh(architecture, policies, torch.default_generator)
@@ -280,6 +287,7 @@ class KeepsNothing(Good):
         (NotFinite, "with NaN or infinite"),
         (NotABatch, "gave a tuple, not a PolicyBatch"),
         (GlobalDraws, "two calls of sample with one seed"),
+        (FitsAtRandom, "two fits with one seed gave different generators"),
         (Remembers, "other networks after other requests"),
         (SeedsNothing, "same networks for two seeds"),
         (Copies, "same network twice"),

@@ -123,6 +123,24 @@ def test_a_changed_plug_in_is_run_again(
     assert len(list(fresh.rglob("run.json"))) == 3
 
 
+def test_a_plug_in_is_not_scored_with_the_code_of_another(
+    call: Call, fresh: Path, plugin: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Copies of an experiment's folder have files of the same names."""
+    addresses = []
+    for scale in (1, 2):
+        copy = plugin.parent / str(scale) / plugin.name
+        copy.parent.mkdir()
+        (copy.parent / "its_scale.py").write_text(f"SCALE = {scale}\n")
+        copy.write_text("from its_scale import SCALE\n" + plugin.read_text())
+        addresses.append(f"{copy}:Zeros")
+    what = ["--task", "Formula-v1", "--episodes", "2", "--policies", "1", "--output", fresh]
+    assert call("run", "--method", ",".join(addresses), *what) == 1
+    out, err = capsys.readouterr()
+    assert "its_scale.py of that name is loaded; use a command for each of them" in err
+    assert out.count("my_method.py:Zeros") > 0 and len(list(fresh.rglob("run.json"))) == 1
+
+
 def test_a_crash_in_a_plug_in_does_not_cost_the_others(
     call: Call, fresh: Path, plugin: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

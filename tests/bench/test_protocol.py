@@ -35,8 +35,8 @@ def test_no_architecture_is_in_two_splits_and_extensions_are_beyond_the_zoo() ->
     ("split", "name", "message"),
     [
         ("unseen", "32-32-16-46", "did you mean 32-32-16-64"),
-        ("unseen", "64-64-64-64", "not unseen but seen: add --split seen"),
-        ("unseen", "96-96-96-96", "not unseen but wide: add --split wide"),
+        ("unseen", "64-64-64-64", "not unseen but seen: use --split seen"),
+        ("unseen", "96-96-96-96", "not unseen but wide: use --split wide"),
         ("joint", "1-2-3", "the generator chooses the architectures"),
         ("unsen", "64-64-64-64", "did you mean unseen"),
     ],

@@ -5,6 +5,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -81,14 +82,46 @@ def test_a_damaged_record_stops_nothing(store: Store, pick: Protocol, capsys: py
 
 
 def test_the_newest_whole_run_is_taken(store: Store, pick: Protocol) -> None:
-    old, new = (store("nnit", pick.model_copy(update={"seed": seed}), outcomes(0.9, 80)) for seed in (0, 1))
+    old, new = (store("nnit", pick, outcomes(0.9, 80), zoo=zoo) for zoo in ("old", "new"))
+    other = store("nnit", pick.model_copy(update={"seed": 1}), outcomes(0.9, 80))
+    assert other.departures == ("seed 1",) and new.departures == ()
     part = pick.model_copy(update={"policies": {"16-16-16-32": 10}})
     part_of_it = store("nnit", part, outcomes(0.9, 10))
     found = results.find([old.folder.parents[3]])
-    assert len(found) == 3 and not part_of_it.is_whole
+    assert len(found) == 4 and not part_of_it.is_whole
     assert results.resolve("nnit", found, "PickCube-v1", "unseen").record.run_id == new.record.run_id
     by_folder = results.resolve(str(part_of_it.folder), found, "", "")
     assert by_folder.record.run_id == part_of_it.record.run_id
+
+
+def test_a_run_with_settings_of_its_own_does_not_stand_for_the_method_and_is_marked(
+    store: Store, pick: Protocol, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = store("nnit", pick, outcomes(0.9, 80), given={"sampling_steps": 2})
+    report(folders=(tmp_path,), output=tmp_path / "report")
+    assert "\n| nnit, 2 sampling steps |" in (tmp_path / "report" / "report.md").read_text()
+    paper.reproduce(table="full-distribution", folders=(tmp_path,))
+    assert "with 2 sampling steps: NNiT on PickCube-v1, unseen" in capsys.readouterr().out
+    usual = store("nnit", pick, outcomes(0.9, 80))
+    newer = few.record.model_copy(update={"started": datetime.now(UTC)})
+    newer.write(few.folder)
+    chosen = results.latest(results.find([tmp_path]))["PickCube-v1", "unseen", "nnit"]
+    assert chosen.folder.resolve() == usual.folder.resolve()
+
+
+def test_ties_are_told_for_every_pair_that_can_be_compared(store: Store, pick: Protocol, tmp_path: Path) -> None:
+    store("ghn-oracle", pick, outcomes(1.0, 80))
+    store("nnit", pick, outcomes(0.8, 80))
+    store("crop", pick, outcomes(0.8, 80))
+    elsewhere = pick.model_copy(update={"policies": {"16-16-16-32": 10}})
+    store("nearest", elsewhere, outcomes(0.8, 10))
+    another = pick.model_copy(update={"policies": {"16-64-64-32": 10}})
+    store("random", another, outcomes(0.0, 10))
+    report(folders=(tmp_path,), output=tmp_path / "report")
+    rows = [line.split(" | ") for line in (tmp_path / "report" / "report.md").read_text().splitlines()]
+    ties = {row[0].removeprefix("| ").split(" (")[0]: row[5] for row in rows if len(row) == 7}
+    assert "crop" in ties["nnit"] and "nnit" in ties["crop"] and ties["ghn-oracle"] == ""
+    assert ties["random"] == ""
 
 
 def test_shipped_runs_are_marked_and_give_way_to_newer_ones(
@@ -118,7 +151,7 @@ def test_shipped_runs_are_marked_and_give_way_to_newer_ones(
     quick = pick.model_copy(update={"select": SeedRange(first=pick.select.first, count=5)})
     store_run(mine, "nnit", quick, outcomes(0.9, 80)[:, :5])
     assert chosen() == shipped / place
-    again = store_run(mine, "nnit", pick.model_copy(update={"seed": 1}), outcomes(0.8, 80))
+    again = store_run(mine, "nnit", pick, outcomes(0.8, 80), zoo="newer")
     assert chosen() == again.folder
 
 
@@ -145,7 +178,7 @@ def test_report_has_every_method_and_its_figures(
     lines = (output / "report.md").read_text().splitlines()
     of_unseen = lines[: lines.index("## PickCube-v1, joint")]
     rows = [line for line in of_unseen if line.startswith(("| nnit", "| crop", "| random"))]
-    assert ["tied" in row for row in rows] == [False, True, False]
+    assert [row.split(" | ")[5] for row in rows] == ["nnit", "crop", ""]
     assert rows[2].startswith("| random") and rows[2].endswith("| 2.0% (0.02) |")
     assert any(line.startswith("| NNiT, unseen | paper | 38.70 ±0.36 | 99") for line in lines)
 

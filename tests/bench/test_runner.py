@@ -15,6 +15,7 @@ from nnit_baselines.controls.resized import Crop
 from nnit_bench import records, runner, scores
 from nnit_bench.execution import Execution
 from nnit_bench.protocol import Protocol
+from nnit_bench.provenance import this_code
 from nnit_bench.records import RunRecord
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.errors import UserError
@@ -27,7 +28,8 @@ def silent(label: str, total: int) -> Any:
 
 
 def entry_of(generator: Any, **given: Any) -> runner.Entry:
-    return runner.Entry(runner.describe("seeded", generator, given), type(generator).__module__, generator, None, 0.0)
+    code = this_code(type(generator).__module__)
+    return runner.Entry(runner.describe("seeded", generator, given), code, generator, None, 0.0)
 
 
 @pytest.fixture
@@ -152,10 +154,12 @@ def test_an_interrupted_run_keeps_its_work_and_is_finished(
             run()
     assert stores[0] == stores[1] and (stores[0] / "unit").exists()
     folder = stores[0].parent
-    assert RunRecord.read(folder).status == "started"
+    begun = RunRecord.read(folder)
+    assert begun.status == "started"
     with pytest.raises(UserError, match="has not finished; --overwrite missing"):
         run(overwrite="never")
-    assert run().record.status == "success"
+    record = run().record
+    assert (record.status, record.resumed, record.started) == ("success", True, begun.started)
     assert sorted(path.name for path in folder.iterdir()) == ["episodes.parquet", "policies.parquet", "run.json"]
 
 
@@ -215,9 +219,13 @@ def test_the_zoos_row_holds_the_same_architectures_only(zoo_index: pa.Table, pro
     assert row is not None
     assert (row.policies, row.episodes, row.worst) == (4, 64, "16-16-16-32")
     assert row.estimates["success_at_end"]["mean"].value == 0.75
+    top = row.estimates["success_at_end"]["top"]
+    assert top.low == top.value == top.high  # of given policies, on episodes that are not known: no interval
     only = protocol.model_copy(update={"policies": {"32-32-16-64": 3}})
     narrow = runner.zoo_row(zoo_index, only)
     assert narrow is not None and narrow.estimates["return"]["mean"].value == 35
+    assert narrow.estimates["return"]["mean"] == narrow.estimates["return"]["worst"]
+    assert narrow.estimates["return"]["mean"].low < 35
     assert runner.zoo_row(zoo_index, protocol.model_copy(update={"policies": {"64-64-64-16": 3}})) is None
     chosen = runner.zoo_row(zoo_index, protocol.model_copy(update={"split": "joint", "policies": {"any": 3}}))
     assert chosen is not None and chosen.policies == 1

@@ -93,7 +93,8 @@ class NNiT(Generator):
     @classmethod
     def from_state(cls, config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
         """The NNiT with this form, these settings and parameters."""
-        generator = cls(NNiTConfig.model_validate(config["settings"]))
+        generator = cls()
+        generator.settings = NNiTConfig.model_validate(config["settings"])
         form = dict(config["form"])
         generator._take(Form(**form | {"vocabulary": tuple(form["vocabulary"])}))
         generator._restore(tensors)

@@ -103,7 +103,7 @@ class Trainer:
     def load(self, path: Path) -> None:
         """Go on from a state; raises UserError if it is of another training."""
         try:
-            state = torch.load(path, weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
             identity = state["identity"]
         except (RuntimeError, KeyError, TypeError, EOFError, UnpicklingError):
             raise UserError(f"{path} is damaged, or no state of a training; delete it to start anew") from None
@@ -160,7 +160,8 @@ class Log:
         if self.path is None or not self.path.is_file():
             return
         lines = self.path.read_text().splitlines(keepends=True)
-        kept = [line for line in lines if json.loads(line)["step"] <= step]
+        whole = [line for line in lines if line.endswith("\n")]  # a full disk can leave less of the last one
+        kept = [line for line in whole if json.loads(line)["step"] <= step]
         write_bytes(self.path, "".join(kept).encode())
 
     def add(self, trainer: Trainer, losses: list[float]) -> None:
