@@ -20,6 +20,7 @@ from huggingface_hub import DatasetCardData
 
 from nnit_zoo import files, tasks
 from nnit_zoo.atomic import write_atomically, write_bytes, write_json
+from nnit_zoo.errors import UserError
 from nnit_zoo.places import data_folder
 from nnit_zoo.summary import by_split
 from nnit_zoo.zoo import Zoo, damaged
@@ -143,18 +144,22 @@ def readme(indexes: Sequence[tuple[files.Manifest, pa.Table]], repository: str =
 def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> None:
     """Write the zoos to `folder` as a data set: per task its files, task.json and policies/<split>.parquet.
 
-    The zoo that ships also gets what it was made from, and all candidates' scores, in build/. Raises
-    UserError if a zoo lacks a shard.
+    The zoo that ships also gets what it was made from, and all candidates' scores, in build/, and in task.json how.
+    Raises UserError if a zoo lacks a shard, or if `folder` holds another one, which its README would not list.
     """
+    there = {path.parent.name for path in folder.glob(f"*/{files.MANIFEST}")}
+    if lost := sorted(there - {zoo.task for zoo in zoos}):
+        raise UserError(f"{folder} holds the data set of {', '.join(lost)}; choose another folder")
     for zoo in zoos:
         place = folder / zoo.task
         for name in zoo.manifest.missing(zoo.folder, zoo.manifest.files):
             raise damaged(zoo.folder / name, zoo.task)
         for name in (*zoo.manifest.files, files.MANIFEST):
             write_atomically(place / name, partial(shutil.copyfile, zoo.folder / name))
-        write_json(place / "task.json", tasks.get(zoo.task).record)
-        data = data_folder(zoo.task)
-        if (data / files.MANIFEST).is_file() and files.Manifest.read(data) == zoo.manifest:
+        record, data = tasks.get(zoo.task).record, data_folder(zoo.task)
+        ships = (data / files.MANIFEST).is_file() and files.Manifest.read(data) == zoo.manifest
+        write_json(place / "task.json", {name: value for name, value in record.items() if name != "build" or ships})
+        if ships:
             for name in (files.EXPERT, files.GHNS, files.SELECTION, files.CANDIDATE_EPISODES):
                 if (data / name).is_file():  # MNIST-PCA32 has no expert
                     write_atomically(place / "build" / name, partial(shutil.copyfile, data / name))

@@ -127,7 +127,7 @@ def download(
     from nnit_zoo.display import Display
     from nnit_zoo.download import Download
 
-    zoo = Download(task, folder, source=source, revision=revision)
+    zoo = Download(task, folder, source=source or None, revision=revision)
     target, splits = zoo.folder, split or files.SPLITS
     if dry_run:
         count, missing = len(zoo.wanted(splits)), zoo.missing(splits)
@@ -213,6 +213,8 @@ def stats(
     from nnit_zoo.display import Display
     from nnit_zoo.zoo import load
 
+    if output is not None:
+        analyses.require_matplotlib()
     zoo = load(task, folder)
     chosen = [zoo.parse(text) for text in architecture or analyses.ARCHITECTURES]
     with Display(quiet=False).stage(f"analysing {task}", len(chosen) + len(zoo.architectures("seen"))) as tell:

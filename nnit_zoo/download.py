@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -28,6 +29,11 @@ class Download:
     ) -> None:
         self.task = task
         self.folder = places.default_folder(task) if folder is None else folder
+        held = task
+        with suppress(UserError):  # no zoo, or none that can be read
+            held = files.Manifest.read(self.folder).task
+        if held != task:
+            raise UserError(f"{self.folder} holds the zoo of {held}; choose another folder for that of {task}")
         self._verb = "fetching" if source else "making"
         self._index: pa.Table
         self._bring: Callable[[Path, Progress, Collection[str]], None]

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import httpx2
 from huggingface_hub import HfApi, HfFileSystem
@@ -96,10 +96,17 @@ class Source:
 
 
 def push(repository: str, folder: Path) -> str:
-    """Upload a folder as a data set of the Hub, made if it is not there; returns the address of the commit."""
+    """Upload a folder as a data set of the Hub, made if it is not there; returns the address of the commit.
+
+    Raises UserError if it holds other zoos, which the new README would not list, or if the Hub refuses.
+    """
     with _explained(repository):
         hub = HfApi()
         hub.create_repo(repository, repo_type="dataset", exist_ok=True)
+        there = {PurePosixPath(each.rfilename) for each in hub.dataset_info(repository).siblings or ()}
+        held = {str(path.parent) for path in there if path.name == MANIFEST}
+        if lost := sorted(held - {path.parent.name for path in folder.glob(f"*/{MANIFEST}")}):
+            raise UserError(f"{repository} also holds {', '.join(lost)}: name all of its tasks with --task")
         return str(hub.upload_folder(repo_id=repository, folder_path=folder, repo_type="dataset"))
 
 

@@ -27,8 +27,8 @@ def commit() -> Commit:
     # Installed inside somebody else's checkout, this file is not that checkout's: git must track it.
     if _git("ls-files", "--error-unmatch", __file__) is None:
         return Commit(None, None)
-    changes = _git("status", "--porcelain", "--", ":(top)", ":(top,exclude)nnit_zoo/data")
-    return Commit(_git("rev-parse", "HEAD"), bool(changes))
+    changes = _git("status", "--porcelain", "--", ":(top)", ":(top,exclude,glob)nnit_zoo/data/*/**")
+    return Commit(_git("rev-parse", "HEAD"), None if changes is None else bool(changes))
 
 
 def _git(*arguments: str) -> str | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -144,15 +145,19 @@ def twins(task: str) -> list[dict[str, Any]]:
     ]
 
 
+def require_matplotlib() -> None:
+    """Raise UserError if matplotlib, which is an extra, is not installed."""
+    if find_spec("matplotlib") is None:
+        raise UserError("figures need matplotlib; run: pip install 'nnit[figures]'")
+
+
 def draw(zoo: Zoo, chosen: Sequence[Architecture], folder: Path) -> Iterator[Path]:
     """Write magnitudes.png (heat maps of |W| over seeds) and pairs.png (histograms over pairs); gives their paths.
 
-    Raises UserError if matplotlib is not installed.
+    It needs matplotlib: `require_matplotlib` says so.
     """
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415  an extra
-    except ImportError:
-        raise UserError("figures need matplotlib; run: pip install 'nnit[figures]'") from None
+    from matplotlib.figure import Figure  # noqa: PLC0415  an extra
+
     batches = [zoo.batch(architecture, "seen") for architecture in chosen]
     pictures = (
         ("magnitudes", "mean |W| of each input neuron", _magnitudes),

@@ -56,11 +56,15 @@ class Builder(ABC):
     def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
         """What trains the GHN of a seed into a file and returns a log line, and how, for the zoo's record."""
 
+    @abstractmethod
+    def made_from(self) -> dict[str, str]:
+        """Hashes of what the GHNs and their scores come from; a stage does not go on with others."""
+
     def ghns(self) -> None:
         """Train one GHN per seed."""
         train, settings = self.training()
         missing = [seed for seed in self.seeds if not self._ghn(seed).exists()]
-        self._sign("ghns", settings, works=bool(missing))
+        self._sign("ghns", {**settings, **self.made_from()}, works=bool(missing))
         with Display(quiet=False).stage("ghns", len(missing)) as advance:
             for _, line in unordered(lambda seed: train(self._ghn(seed), seed), missing, self.workers):
                 log(f"ghns: {line}")
@@ -73,7 +77,8 @@ class Builder(ABC):
         missing = [(split, architecture) for split, architecture in listed if not self._is_scored(architecture)]
         episodes = self.task.scoring_seeds
         counts = {"episodes": len(episodes), "yardstick_episodes": len(episodes[: self.yardstick_episodes])}
-        self._sign("scores", {**counts, "seeds_from": episodes.start}, works=bool(missing))
+        settings = {**counts, "seeds_from": episodes.start, **self.made_from()}
+        self._sign("scores", settings, works=bool(missing))
         count = sum(len(seeds) * len(episodes) for split, _ in missing for seeds, episodes in self._to_score(split))
         with Display(quiet=False).stage("scores: episodes", count) as advance:
             for split, architecture in missing:
@@ -140,7 +145,7 @@ class Builder(ABC):
         seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]
         passed, kept = (sum(row[name] for row in seen) for name in ("passed", "kept"))
         record = json.loads((self.data / "task.json").read_text())
-        made = {stage: self._made(stage) for stage in self.stages}
+        made = {stage: self._made(stage) for stage in ("states", "ghns", "scores")}
         record["build"] |= {stage: json.loads(path.read_text()) for stage, path in made.items() if path.exists()}
         write_json(self.data / "task.json", record)
         log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass, {kept:,} are kept")
@@ -171,8 +176,10 @@ class Builder(ABC):
         return self.work / stage / "made.json"
 
     def _sign(self, stage: str, settings: dict[str, Any], *, works: bool) -> None:
-        """Keep the stage's record; raises UserError if what is there was made with other settings."""
+        """Keep the stage's record; raises UserError if what is there was made with other settings, or unknown ones."""
         path, settings = self._made(stage), json.loads(json.dumps(settings))
+        if not path.exists() and path.parent.is_dir() and any(path.parent.iterdir()):
+            raise UserError(f"{path.parent} has no {path.name} that says how its files were made; move it elsewhere")
         made = json.loads(path.read_text()) if path.exists() else {**settings, "commits": []}
         if {name: value for name, value in made.items() if name != "commits"} != settings:
             raise UserError(f"{path.parent} was made with other settings, as {path.name} there says; move it elsewhere")

@@ -23,6 +23,7 @@ from nnit_zoo.atomic import write_atomically, write_json
 from nnit_zoo.build.builder import Builder, log
 from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
 from nnit_zoo.errors import UserError
+from nnit_zoo.files import sha256_of
 from nnit_zoo.ghn import GHN
 from nnit_zoo.parallel import Backend
 from nnit_zoo.provenance import commit
@@ -182,4 +183,9 @@ class MNISTBuilder(Builder):
 
     def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
         """Cross entropy on the training digits; there is no expert."""
-        return partial(train_ghn, self.config), {**self.config.model_dump(), "digits": 60_000}
+        _, labels = MNISTPCA32().digits("train")
+        return partial(train_ghn, self.config), {**self.config.model_dump(), "digits": len(labels)}
+
+    def made_from(self) -> dict[str, str]:
+        """The features."""
+        return {"features_sha256": sha256_of(self.data / FEATURES)}

@@ -23,7 +23,7 @@ from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import EXPERT
+from nnit_zoo.files import EXPERT, sha256_of
 from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.provenance import commit
 from nnit_zoo.tasks.robot import RobotPolicyTask
@@ -53,6 +53,7 @@ class RobotBuilder(Builder):
         if (self.data / EXPERT).exists():
             log("expert: done")
             return
+        self._sign("expert", self.expert_config.model_dump(), works=True)
         record = experts.train(self.task, self.expert_config, self.work / "expert", self.workers, log)
         network = experts.load(self.work / "expert" / EXPERT)
         episodes = experts.play(self.task, network, experts.EVALUATION_SEEDS)
@@ -77,7 +78,7 @@ class RobotBuilder(Builder):
     def states(self) -> None:
         """Gather the shared buffer of states by DAgger."""
         expert, done = self._expert(), self._states.exists()
-        self._sign("states", self.distill_config.model_dump(), works=not done)
+        self._sign("states", {**self.distill_config.model_dump(), **self.made_from()}, works=not done)
         if done:
             log("states: done")
         else:
@@ -88,6 +89,11 @@ class RobotBuilder(Builder):
         train = partial(distill.train_ghn, self.task, self.distill_config, self._expert(), self._states)
         return train, {**self.distill_config.model_dump(), "states": self._count_states()}
 
+    def made_from(self) -> dict[str, str]:
+        """The expert, and what the states that it visits standardise observations by."""
+        self._expert()  # says what to do without one
+        return {"expert_sha256": sha256_of(self.data / EXPERT), "standardisation": self.task.standardisation}
+
     def twins(self) -> None:
         """Train and measure NNiT's twin populations; the networks, too large to ship, stay in the work folder."""
         if not self._states.exists():
@@ -96,6 +102,7 @@ class RobotBuilder(Builder):
         seeds = range(config.networks)
         paths = {kind: [folder / kind / f"{seed:03d}.safetensors" for seed in seeds] for kind in twins.KINDS}
         missing = [(path, kind) for kind in twins.KINDS for path in paths[kind] if not path.exists()]
+        self._sign("twins", {**config.model_dump(), **self.made_from()}, works=bool(missing))
         train = partial(twins.train, self.task, config, self._expert(), self._states)
         with Display(quiet=False).stage("twins", len(missing)) as advance:
             for _, line in unordered(lambda unit: train(*unit), missing, self.workers):
@@ -116,7 +123,7 @@ class RobotBuilder(Builder):
             "episodes": len(self.task.scoring_seeds),
             "seeds_from": self.task.scoring_seeds.start,
             "config": config.model_dump(),
-            "commit": str(commit()),
+            "commits": json.loads(self._made("twins").read_text())["commits"],
         }
         write_json(self.data / stats.TWINS, content)
         shutil.rmtree(folder / "units", ignore_errors=True)

@@ -302,6 +302,29 @@ def test_a_build_does_not_go_on_with_other_settings(builder, tmp_path):
     with pytest.raises(UserError, match="made with other settings"):
         other.ghns()
 
+    sample = Path(__file__).parents[1] / "zoo" / "mnist"
+    builder(tmp_path, "MNIST-PCA32", source=str(sample)).features()
+    with pytest.raises(UserError, match="made with other settings"):
+        builder(tmp_path, "MNIST-PCA32").ghns()
+    (tmp_path / "work" / "ghns" / "made.json").unlink()
+    with pytest.raises(UserError, match=r"no made\.json that says how its files were made"):
+        builder(tmp_path, "MNIST-PCA32").ghns()
+
+
+def test_nothing_is_built_on_another_expert(builder, tmp_path):
+    built = builder(tmp_path)
+    built.expert()
+    built.states()
+    (data_folder("PickCube-v1") / "expert.safetensors").unlink()
+    other = builder(tmp_path)
+    other.expert_config = TINY_EXPERT.model_copy(update={"seed": 1})
+    with pytest.raises(UserError, match="expert was made with other settings"):
+        other.expert()
+    shutil.rmtree(tmp_path / "work" / "expert")
+    other.expert()
+    with pytest.raises(UserError, match="states was made with other settings"):
+        builder(tmp_path).states()
+
 
 def test_a_zoo_is_in_place_until_another_is_whole_and_not_replaced_by_a_smaller_one(builder, tmp_path, monkeypatch):
     run_all(builder(tmp_path, "MNIST-PCA32"))

@@ -88,7 +88,7 @@ def test_a_mistake_exits_with_2_and_no_traceback(arguments: tuple[str, ...]) -> 
     assert "Traceback" not in stderr
 
 
-def test_list_and_show_need_no_download(nnit_zoo: Command) -> None:
+def test_list_and_show_need_no_download(nnit_zoo: Command, home: Path) -> None:
     (zoo,) = json.loads(nnit_zoo("list", "--json")[1])
     assert (zoo["task"], zoo["policies"], zoo["shards"], zoo["shards_downloaded"]) == ("PickCube-v1", 11, 4, 0)
     assert zoo["splits"]["seen"]["policies"] == 3
@@ -97,6 +97,10 @@ def test_list_and_show_need_no_download(nnit_zoo: Command) -> None:
     assert shown == zoo | {"layout": shown["layout"]}
     assert shown["layout"]["obj_pose"] == "29-35"
     assert shown["pass_rates"] == {"32-16-64-32": 1.0, "64-64-64-32": 0.5}
+    there = home / "nnit" / "zoo" / "PickCube-v1" / "manifest.json"
+    there.parent.mkdir(parents=True)
+    there.write_text("{")
+    assert nnit_zoo("list", "--json")[0] == 0  # whatever lies where the zoo should
     table = nnit_zoo("show")[1]
     assert "heldout_seed" in table and "75.0% pass the thresholds; fewest of 64-64-64-32: 50.0%" in table
     policies = json.loads(nnit_zoo("show", "--architecture", "64-64-64-32", "--json")[1])
@@ -142,6 +146,12 @@ def test_a_source_with_another_version_does_not_replace_the_zoo(
     manifest.shards.pop("16-16-16-32.safetensors")
     (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
     assert_error(nnit_zoo("download", "--source", str(zoo_folder)), "another version of the zoo", "--folder")
+
+
+def test_a_zoo_does_not_take_the_place_of_another_tasks(nnit_zoo: Command, zoo_folder: Path) -> None:
+    manifest = files.Manifest.read(zoo_folder).model_copy(update={"task": "PushCube-v1"})
+    (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
+    assert_error(nnit_zoo("download", "--folder", str(zoo_folder)), "holds the zoo of PushCube-v1", "another folder")
 
 
 def playing(scores: dict[int, tuple[int, float]]) -> Callable[..., pa.Table]:

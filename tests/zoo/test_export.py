@@ -49,6 +49,8 @@ def test_a_data_set_holds_every_candidates_scores(
 ) -> None:
     card.write_dataset(tmp_path / "another", [Zoo.open(made_once)])
     assert not (tmp_path / "another" / "PickCube-v1" / "build").exists()
+    record = json.loads((tmp_path / "another" / "PickCube-v1" / "task.json").read_text())
+    assert "observation_mean" in record and "build" not in record  # which says how the zoo that ships was built
     monkeypatch.setattr(places, "DATA", data_folder.parent)
     card.write_dataset(tmp_path / "ours", [Zoo.open(made_once)])
     for name in ("ghns.safetensors", "selection.parquet"):
@@ -155,3 +157,8 @@ def test_a_zoo_that_lacks_a_shard_makes_no_dataset(zoo_folder: Path, tmp_path: P
     (zoo_folder / "16-16-16-32.safetensors").unlink()
     with pytest.raises(UserError, match=r"16-16-16-32.safetensors is missing"):
         card.write_dataset(tmp_path / "set", [Zoo.open(zoo_folder)])
+
+
+def test_a_dataset_is_not_written_over_that_of_another_task(dataset: Path, made_once: Path) -> None:
+    with pytest.raises(UserError, match="holds the data set of MNIST-PCA32"):
+        card.write_dataset(dataset, [Zoo.open(made_once)])

@@ -137,6 +137,14 @@ def test_what_is_pushed_can_be_downloaded(hub, made_once: Path, tmp_path: Path) 
     assert contents(tmp_path / "zoo") == contents(made_once)
 
 
+def test_a_push_does_not_take_other_zoos_off_the_card(hub, made_once: Path, tmp_path: Path) -> None:
+    card.write_dataset(tmp_path / "set", [Zoo.open(made_once)], "someone/new")
+    push("someone/new", tmp_path / "set")
+    (tmp_path / "set" / "PickCube-v1").rename(tmp_path / "set" / "PushCube-v1")
+    with pytest.raises(UserError, match="someone/new also holds PickCube-v1: name all of its tasks"):
+        push("someone/new", tmp_path / "set")
+
+
 def test_a_refused_push_says_how_to_log_in(hub, tmp_path: Path) -> None:
     hub.closed = True
     with pytest.raises(UserError, match=r"(?s)refuses someone/new.*hf auth login"):

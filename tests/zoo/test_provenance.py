@@ -49,8 +49,13 @@ def test_the_commit_and_whether_it_was_changed(checkout: Path) -> None:
     sha = head.stdout.strip()
     module = load(checkout)
     assert (module.commit().sha, module.commit().dirty, str(module.commit())) == (sha, False, sha)
-    (checkout / "nnit_zoo" / "data").mkdir(parents=True)
-    (checkout / "nnit_zoo" / "data" / "ghns.safetensors").write_text("a zoo")
+    zoo = checkout / "nnit_zoo" / "data" / "Task-v1" / "ghns.safetensors"
+    zoo.parent.mkdir(parents=True)
+    zoo.write_text("a zoo")
     assert module.commit().dirty is False
+    splits = zoo.parents[1] / "architectures.json"
+    splits.write_text("other splits")
+    assert module.commit().dirty is True
+    splits.unlink()
     (checkout / "file").write_text("two")
     assert str(module.commit()) == f"{sha}-dirty"
