@@ -103,8 +103,8 @@ def push(repository: str, folder: Path) -> str:
     with _explained(repository):
         hub = HfApi()
         hub.create_repo(repository, repo_type="dataset", exist_ok=True)
-        there = {PurePosixPath(each.rfilename) for each in hub.dataset_info(repository).siblings or ()}
-        held = {str(path.parent) for path in there if path.name == MANIFEST}
+        there = [PurePosixPath(each.rfilename) for each in hub.dataset_info(repository).siblings or ()]
+        held = {path.parent.name for path in there if path.match(f"*/{MANIFEST}")}
         if lost := sorted(held - {path.parent.name for path in folder.glob(f"*/{MANIFEST}")}):
             raise UserError(f"{repository} also holds {', '.join(lost)}: name all of its tasks with --task")
         return str(hub.upload_folder(repo_id=repository, folder_path=folder, repo_type="dataset"))

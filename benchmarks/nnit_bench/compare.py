@@ -81,10 +81,8 @@ def differ(first: StoredRun, second: StoredRun) -> list[Difference]:
     each method's policies are drawn for themselves. Of the `top` ones, which are given, only episodes. Raises
     Incomparable if they were not measured alike, or share no architecture or episode.
     """
-    ours, theirs = first.record.protocol, second.record.protocol
-    if not ours.measures_like(theirs):
-        raise Incomparable(f"{_what(ours)} and {_what(theirs)} are not measured alike and cannot be compared")
-    parts = {"mean": _paired([scores.everything(run.episodes, run.record.protocol) for run in (first, second)], ours)}
+    ours = first.record.protocol
+    parts = {"mean": _everything(first, second)}
     for name, both in _picked(first, second).items():
         parts[name] = _same_episodes(both)
     found = []
@@ -98,14 +96,20 @@ def differ(first: StoredRun, second: StoredRun) -> list[Difference]:
 
 def tied(first: StoredRun, second: StoredRun) -> bool:
     """Whether two runs can be compared, and not be told apart in their mean headline score."""
+    protocol = first.record.protocol
     try:
-        return not differ(first, second)[0].separable
+        change = _difference(*_everything(first, second), protocol.metrics[0], protocol, drawn=True)
     except Incomparable:
         return False
+    return change.low <= 0 <= change.high
 
 
-def _paired(both: Sequence[Scores], protocol: Protocol) -> tuple[Scores, Scores]:
-    """The scores on the architectures and episodes that both have; raises Incomparable if there are none."""
+def _everything(first: StoredRun, second: StoredRun) -> tuple[Scores, Scores]:
+    """All scores on the architectures and episodes that both have; raises Incomparable as `differ` does."""
+    protocol, theirs = first.record.protocol, second.record.protocol
+    if not protocol.measures_like(theirs):
+        raise Incomparable(f"{_what(protocol)} and {_what(theirs)} are not measured alike and cannot be compared")
+    both = [scores.everything(run.episodes, run.record.protocol) for run in (first, second)]
     if not protocol.is_joint:
         shared = set(both[0].architectures.tolist()) & set(both[1].architectures.tolist())
         if not shared:

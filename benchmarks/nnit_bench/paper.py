@@ -241,8 +241,8 @@ def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> Store
         table.notes.append(f"unsupported: {name} on {task}, {split}: {run.record.error}")
     elif not run.is_whole:
         table.notes.append(f"in part: the run of {name} on {task}, {split} has not all policies of the protocol")
-    if run and run.departures:
-        table.notes.append(f"with {', '.join(run.departures)}: {name} on {task}, {split}")
+    if run and run.given:
+        table.notes.append(f"with {', '.join(run.given)}: {name} on {task}, {split}")
     if run and run.is_shipped:
         table.notes.append(f"shipped, not run here: {name} on {task}, {split}")
     if run and name == "NNiT" and run.record.method.training.get("preset") != "paper":

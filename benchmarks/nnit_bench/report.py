@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,8 +43,10 @@ def report(*, folders: Folders = FOLDERS, output: Path = Path("report"), as_json
         raise UserError(f"no finished runs in {', '.join(map(str, folders))}; make one with: nnit-bench run")
     groups = _grouped(runs)
     content = json.dumps([_plain(run) for group in groups for run in group], indent=2) + "\n"
-    figures = dict(_figures(groups)) if find_spec("matplotlib") else {}
-    if not figures:
+    figures: dict[str, Figure] = {}
+    if find_spec("matplotlib"):
+        figures |= _figures(groups)
+    else:
         sys.stderr.write("tables only: figures need matplotlib; run: pip install 'nnit[figures]'\n")
     write_bytes(output / "report.json", content.encode())
     write_bytes(output / "report.csv", _csv(groups).encode())
@@ -114,7 +117,8 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
         best = f"top-{protocol.top}"
         heading = ["method", "mean", best, "held out", "worst architecture", "tied with", "nearest known"]
         parts.append("| " + " | ".join(heading) + " |\n|---|" + "---:|" * (len(heading) - 1))
-        parts += [_row(run, group, metric) for run in group]
+        ties = _ties(group)
+        parts += [_row(run, group, metric, ties[run.folder]) for run in group]
         parts.append("")
         parts += [f"![{name}]({name})\n" for name in figures if name in _figure_names(group)]
     latest = {
@@ -127,9 +131,19 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
     return "\n".join(parts)
 
 
-def _row(run: StoredRun, group: Group, metric: Metric) -> str:
+def _ties(group: Group) -> dict[Path, list[str]]:
+    """The folder of each run -> the methods that it cannot be told apart from."""
+    ties: dict[Path, list[str]] = {run.folder: [] for run in group}
+    for one, other in combinations((run for run in group if run.record.results), 2):
+        if tied(one, other):
+            ties[one.folder].append(other.record.method.label)
+            ties[other.folder].append(one.record.method.label)
+    return ties
+
+
+def _row(run: StoredRun, group: Group, metric: Metric, ties: Sequence[str]) -> str:
     record = run.record
-    marks = [*run.departures, "upper bound" * record.method.oracle, "shipped" * run.is_shipped]
+    marks = [*run.given, "upper bound" * record.method.oracle, "shipped" * run.is_shipped]
     name = ", ".join([record.method.label + _size(run, group), *filter(None, marks)])
     if record.results is None:
         return f"| {name} | {record.status}: {record.error} |" + " |" * 5
@@ -137,11 +151,10 @@ def _row(run: StoredRun, group: Group, metric: Metric) -> str:
     cells = [_cell(numbers.get(name), metric) for name in ("mean", "top", "top_heldout", "worst")]
     if record.results.worst:
         cells[-1] += f" {record.results.worst}"
-    others = [each for each in group if each is not run and each.record.results and tied(run, each)]
     same = record.novelty and record.novelty.same_architecture
     ratio = "" if not same or same.ratio is None else f" ({same.ratio:.2f})"
     distance = f"{same.median:.1%}{ratio}" if same else "-"
-    return "| " + " | ".join([name, *cells, ", ".join(each.record.method.label for each in others), distance]) + " |"
+    return "| " + " | ".join([name, *cells, ", ".join(ties), distance]) + " |"
 
 
 def _size(run: StoredRun, group: Group) -> str:

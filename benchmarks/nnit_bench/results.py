@@ -56,14 +56,20 @@ class StoredRun:
     @property
     def departures(self) -> tuple[str, ...]:
         """Which of its settings are not the benchmark's, in words; numbers of policies and episodes apart."""
-        protocol, given = self.record.protocol, self.record.method.given
-        found = {
-            f"on {protocol.simulator}": protocol.simulator not in (None, "fast"),
-            f"seed {protocol.seed}": protocol.seed != 0,
-            f"{given.get('sampling_steps')} sampling steps": "sampling_steps" in given,
-            f"checkpoint {given.get('checkpoint')}": "checkpoint" in given,
-        }
-        return tuple(words for words, so in found.items() if so)
+        protocol, words = self.record.protocol, []
+        if protocol.simulator not in (None, "fast"):
+            words.append(f"on {protocol.simulator}")
+        if protocol.seed != 0:
+            words.append(f"seed {protocol.seed}")
+        if steps := self.record.method.given.get("sampling_steps"):
+            words.append(f"{steps} sampling steps")
+        return tuple(words)
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """What the command gave it, in words: departures from the benchmark, and a checkpoint, which is none."""
+        checkpoint = self.record.method.given.get("checkpoint")
+        return (*self.departures, f"checkpoint {checkpoint}") if checkpoint else self.departures
 
 
 def find(folders: Iterable[Path]) -> list[StoredRun]:
@@ -89,9 +95,8 @@ def latest(runs: Iterable[StoredRun]) -> dict[tuple[str, str, str], StoredRun]:
 
     def rank(run: StoredRun) -> tuple[bool, bool, int, int, datetime, bool]:
         protocol = run.record.protocol
-        usual = all(words.startswith("checkpoint") for words in run.departures)
         newest = protocol.task_version, protocol.select.count, run.record.started
-        return run.is_whole, usual, *newest, not run.is_shipped
+        return run.is_whole, not run.departures, *newest, not run.is_shipped
 
     ranked = sorted(runs, key=rank)
     return {(run.record.protocol.task, run.record.protocol.split, run.record.method.name): run for run in ranked}

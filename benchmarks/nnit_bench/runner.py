@@ -92,7 +92,7 @@ def enter(
     elif able.oracle and protocol.split not in SPLITS:
         reason = f"the zoo has no policies of the split {protocol.split}"
     if reason:
-        return Entry(_method(name, able, given), code, None, reason, 0.0)
+        return Entry(_without_checkpoint(name, able, given), code, None, reason, 0.0)
     generator = registry.prepare(name, zoo, protocol.split, checkpoint, protocol.seed)
     if sampling_steps is not None:
         set_sampling_steps(name, generator, sampling_steps)
@@ -103,7 +103,7 @@ def enter(
 def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
     """What identifies a generator; `given` is what the command set on top of its defaults."""
     if not generator.capabilities.checkpoint:
-        return _method(name, generator.capabilities, given)
+        return _without_checkpoint(name, generator.capabilities, given)
     with TemporaryDirectory() as folder:  # also a checkpoint from the Hub is identified by what it is, not by its name
         generator.save_pretrained(folder)
         sha256 = sha256_of(Path(folder) / WEIGHTS)
@@ -118,8 +118,8 @@ def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
     )
 
 
-def _method(name: str, able: Capabilities, given: dict[str, Any]) -> Method:
-    """A generator without a checkpoint."""
+def _without_checkpoint(name: str, able: Capabilities, given: dict[str, Any]) -> Method:
+    """What identifies a generator that is fitted at every run."""
     return Method(
         name=name, config={}, given=given, training={}, parameters=None, checkpoint_sha256=None, oracle=able.oracle
     )

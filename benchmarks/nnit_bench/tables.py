@@ -42,7 +42,7 @@ def show(results: Results) -> None:
         selected = ", which selected them" if protocol.is_joint or protocol.split == "seen" else ""
         console.print(
             f"* the {results.zoo.policies} stored policies of {which} architectures, as scored when the zoo was built, "
-            f"on {results.zoo.episodes} other episodes each{selected}; its intervals leave episodes out"
+            f"{results.zoo.episodes} episodes each{selected}; its intervals leave episodes out"
         )
     for outcome in outcomes:
         _remarks(console, outcome)

@@ -175,8 +175,8 @@ class Builder(ABC):
         """The record of what this stage has made in the work folder: its settings, and the commits that it ran from."""
         return self.work / stage / "made.json"
 
-    def _sign(self, stage: str, settings: dict[str, Any], *, works: bool) -> None:
-        """Keep the stage's record; raises UserError if what is there was made with other settings, or unknown ones."""
+    def _sign(self, stage: str, settings: dict[str, Any], *, works: bool) -> dict[str, Any]:
+        """Keep and give the stage's record; raises UserError if what is there was made otherwise, or without one."""
         path, settings = self._made(stage), json.loads(json.dumps(settings))
         if not path.exists() and path.parent.is_dir() and any(path.parent.iterdir()):
             raise UserError(f"{path.parent} has no {path.name} that says how its files were made; move it elsewhere")
@@ -186,6 +186,7 @@ class Builder(ABC):
         if works and (now := str(commit())) not in made["commits"]:
             made["commits"].append(now)
         write_json(path, made)
+        return dict(made)
 
     @property
     def _units(self) -> Path:

@@ -25,7 +25,6 @@ from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import EXPERT, sha256_of
 from nnit_zoo.parallel import Backend, unordered
-from nnit_zoo.provenance import commit
 from nnit_zoo.tasks.robot import RobotPolicyTask
 from nnit_zoo.tasks.task import PROBE
 
@@ -53,7 +52,7 @@ class RobotBuilder(Builder):
         if (self.data / EXPERT).exists():
             log("expert: done")
             return
-        self._sign("expert", self.expert_config.model_dump(), works=True)
+        made = self._sign("expert", self.expert_config.model_dump(), works=True)
         record = experts.train(self.task, self.expert_config, self.work / "expert", self.workers, log)
         network = experts.load(self.work / "expert" / EXPERT)
         episodes = experts.play(self.task, network, experts.EVALUATION_SEEDS)
@@ -65,7 +64,7 @@ class RobotBuilder(Builder):
                 "version": self.task.version,
                 "observation_mean": states.mean(0).astype(np.float32).tolist(),
                 "observation_std": np.maximum(states.std(0), STD_FLOOR).astype(np.float32).tolist(),
-                "build": {"expert": {**record, "config": self.expert_config.model_dump(), "commit": str(commit())}},
+                "build": {"expert": {**record, "config": self.expert_config.model_dump(), "commits": made["commits"]}},
             },
         )
         probe = torch.from_numpy(states[np.arange(PROBE_STATES) * len(states) // PROBE_STATES]).half()
@@ -102,7 +101,7 @@ class RobotBuilder(Builder):
         seeds = range(config.networks)
         paths = {kind: [folder / kind / f"{seed:03d}.safetensors" for seed in seeds] for kind in twins.KINDS}
         missing = [(path, kind) for kind in twins.KINDS for path in paths[kind] if not path.exists()]
-        self._sign("twins", {**config.model_dump(), **self.made_from()}, works=bool(missing))
+        made = self._sign("twins", {**config.model_dump(), **self.made_from()}, works=bool(missing))
         train = partial(twins.train, self.task, config, self._expert(), self._states)
         with Display(quiet=False).stage("twins", len(missing)) as advance:
             for _, line in unordered(lambda unit: train(*unit), missing, self.workers):
@@ -123,7 +122,7 @@ class RobotBuilder(Builder):
             "episodes": len(self.task.scoring_seeds),
             "seeds_from": self.task.scoring_seeds.start,
             "config": config.model_dump(),
-            "commits": json.loads(self._made("twins").read_text())["commits"],
+            "commits": made["commits"],
         }
         write_json(self.data / stats.TWINS, content)
         shutil.rmtree(folder / "units", ignore_errors=True)

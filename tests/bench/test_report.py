@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -107,6 +108,24 @@ def test_a_run_with_settings_of_its_own_does_not_stand_for_the_method_and_is_mar
     newer.write(few.folder)
     chosen = results.latest(results.find([tmp_path]))["PickCube-v1", "unseen", "nnit"]
     assert chosen.folder.resolve() == usual.folder.resolve()
+
+    own = store("nnit", pick, outcomes(0.9, 80), given={"checkpoint": "runs/mine"}, zoo="newer")
+    chosen = results.latest(results.find([tmp_path]))["PickCube-v1", "unseen", "nnit"]
+    assert chosen.folder.resolve() == own.folder.resolve()
+    paper.reproduce(table="full-distribution", folders=(tmp_path,))
+    assert "with checkpoint runs/mine: NNiT on PickCube-v1, unseen" in capsys.readouterr().out
+
+
+def test_without_matplotlib_there_are_tables(
+    store: Store, pick: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store("nnit", pick, outcomes(0.9, 80))
+    report(folders=(tmp_path,), output=tmp_path / "with")
+    assert "matplotlib" not in capsys.readouterr().err
+    monkeypatch.setattr(sys.modules[report.__module__], "find_spec", lambda name: None)
+    report(folders=(tmp_path,), output=tmp_path / "without")
+    assert "pip install 'nnit[figures]'" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "without").iterdir()) == ["report.csv", "report.json", "report.md"]
 
 
 def test_ties_are_told_for_every_pair_that_can_be_compared(store: Store, pick: Protocol, tmp_path: Path) -> None:
