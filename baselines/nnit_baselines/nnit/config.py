@@ -51,7 +51,7 @@ class NNiTConfig(BaseModel):
     sampling_steps: int = 40
     """Steps from noise to weights."""
 
-    steps: int = 10_000
+    steps: int = 20_000
     """Optimiser steps."""
     batch: int = 16
     """Policies in a step: of one architecture, or if `padded`, of any."""
