@@ -180,13 +180,13 @@ class Builder(ABC):
         path, settings = self._made(stage), json.loads(json.dumps(settings))
         if not path.exists() and path.parent.is_dir() and any(path.parent.iterdir()):
             raise UserError(f"{path.parent} has no {path.name} that says how its files were made; move it elsewhere")
-        made = json.loads(path.read_text()) if path.exists() else {**settings, "commits": []}
+        made: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {**settings, "commits": []}
         if {name: value for name, value in made.items() if name != "commits"} != settings:
             raise UserError(f"{path.parent} was made with other settings, as {path.name} there says; move it elsewhere")
         if works and (now := str(commit())) not in made["commits"]:
             made["commits"].append(now)
         write_json(path, made)
-        return dict(made)
+        return made
 
     @property
     def _units(self) -> Path:
