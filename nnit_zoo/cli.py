@@ -81,11 +81,11 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
             return
         rows = [{"split": split, **row} for split, row in zoo["splits"].items()]
         print_rows(rows, ("split", "architectures", "policies", *files.SCORES))
-        if rates := zoo["pass_rates"]:
-            least = min(rates, key=rates.__getitem__)
-            mean = sum(rates.values()) / len(rates)
-            sys.stdout.write(f"Of the candidates of a seen architecture, {mean:.1%} pass the thresholds; ")
-            sys.stdout.write(f"fewest of {least}: {rates[least]:.1%}.\n")
+        rates = zoo["pass_rates"]
+        least = min(rates, key=rates.__getitem__)
+        mean = sum(rates.values()) / len(rates)
+        sys.stdout.write(f"Of the candidates of a seen architecture, {mean:.1%} pass the thresholds; ")
+        sys.stdout.write(f"fewest of {least}: {rates[least]:.1%}.\n")
         if zoo["layout"]:
             print_table(("input", "entries"), list(zoo["layout"].items()))
         return

@@ -52,7 +52,6 @@ INDEX_SCHEMA = pa.schema(
         ("weight_norm", pa.float32()),
     ]
 )
-ADDED = ("n_params", "weight_norm")  # columns that the index of an older zoo may lack: they are null then
 
 
 def policy_split(split: str, ghn_seed: int) -> str:
@@ -188,8 +187,4 @@ def sha256_of(path: Path) -> str:
 def read_index(path: Path | io.BytesIO, architecture: str | None = None) -> pa.Table:
     """The rows of an index file, of one architecture if given; columns as in INDEX_SCHEMA."""
     table = pq.ParquetFile(path).read()
-    for name in ADDED:
-        if name not in table.column_names:
-            field = INDEX_SCHEMA.field(name)
-            table = table.append_column(field, pa.nulls(len(table), field.type))
     return table if architecture is None else table.filter(pc.equal(table["architecture"], architecture))

@@ -28,13 +28,8 @@ def by_split(index: pa.Table) -> dict[str, dict[str, Any]]:
 
 
 def pass_rates(selection: Path) -> dict[str, float]:
-    """Per seen architecture, the share of its candidates for the corpus that reach the task's thresholds.
-
-    Empty for an older zoo, which does not say.
-    """
+    """Per seen architecture, the share of its candidates for the corpus that reach the task's thresholds."""
     table = pq.ParquetFile(selection).read()
-    if "passed" not in table.column_names:
-        return {}
     candidates = (pc.field("split") == "seen") & (pc.field("ghn_seed") < HELDOUT_SEEDS_FROM)
     rows = table.filter(candidates).group_by("architecture", use_threads=False).aggregate([("passed", "mean")])
     return dict(zip(rows["architecture"].to_pylist(), rows["passed_mean"].to_pylist(), strict=True))
