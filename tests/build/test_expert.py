@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
+import pytest
 import torch
 
 from nnit_zoo.build import expert
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.tasks.pick_cube import PickCube
+from nnit_zoo.tasks.stack_cube_easy import StackCubeEasy
 
 TINY_EXPERT = ExpertConfig(total_steps=300, environments=2, hidden=16, epochs=1, minibatch=50, evaluate_every=1)
 
@@ -33,3 +36,35 @@ def test_advantages_follow_their_definition():
     for start in range(5):
         sums = sum((0.9 * 0.8) ** later * deltas[start + later] for later in range(5 - start))
         torch.testing.assert_close(ours[start], sums)
+
+
+def test_letting_go_is_shown_from_when_the_cube_is_held_in_place(monkeypatch):
+    task = StackCubeEasy()
+    network = expert.network_of(expert.Training(task, TINY_EXPERT).model.actor)
+    observations = np.zeros((4, task.inputs), np.float32)
+    observations[:, 18] = [1, 1, 0, 1]  # is_grasped
+    observations[:, 39:] = np.array([0.0, 0.011, 0.0, 0.013])[:, None] * [1, 0, 0]  # obj_to_goal_pos
+    assert expert._holds_at_goal(task, observations).tolist() == [True, True, False, False]
+
+    calls = iter(range(task.episode_steps))
+    monkeypatch.setattr(expert, "_holds_at_goal", lambda task, observations: np.array([next(calls) == 20, False]))
+    std, seeds = np.full(task.outputs, 0.1, np.float32), range(2)
+    shown = expert.explore(task, network, seeds, std, 5, 1.0).actions[..., -1]
+    plain = expert.explore(task, network, seeds, std, 5, 0.0).actions[..., -1]
+    assert (shown[20:, 0] >= 0.4).all() and (shown[20:, 0] <= 1).all()
+    assert (shown[:20, 0] == plain[:20, 0]).all() and (shown[:, 1] == plain[:, 1]).all()
+    assert abs(plain).max() < 0.6
+
+
+@pytest.mark.parametrize(("weight", "low", "high"), [(0.0, 2.9, 3.1), (1.0, 0.5, 1.1)])
+def test_mean_actions_are_held_within_what_the_robot_takes(weight, low, high):
+    """A gripper whose mean is far outside is out of reach of its noise, and could never learn to open."""
+    config = TINY_EXPERT.model_copy(update={"bound_weight": weight, "learning_rate": 1e-3, "total_steps": 10**6})
+    training = expert.Training(PickCube(), config)
+    with torch.no_grad():
+        training.model.actor[-1].bias.fill_(3.0)
+    observations = torch.zeros(26, 4, PickCube().inputs)
+    for _ in range(100):
+        training._update(observations, torch.full((25, 4, PickCube().outputs), 3.0), torch.zeros(25, 4))
+    means = training.model.actor(observations[0]).abs()
+    assert ((means > low) & (means < high)).all()
