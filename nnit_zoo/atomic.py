@@ -10,18 +10,14 @@ from typing import Any
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` make a file under a temporary name beside `path`, then move it there.
+    """Let `write` make a file under a temporary name beside `path`, then move it there; an OSError names `path`.
 
-    The file may be read by whom the umask says, whatever `write` does: safetensors makes files for their owner alone.
-    An OSError names `path`.
+    What raises no OSError when the disk is full, as torch, safetensors and numpy do, gives bytes to `write_bytes`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
-        temporary.touch()
-        mode = temporary.stat().st_mode
         write(temporary)
-        temporary.chmod(mode)
         temporary.replace(path)
     except OSError as error:
         if error.errno is None:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.errors import UserError
 
 State = Mapping[str, Tensor]
@@ -35,7 +35,7 @@ def write(path: Path, ghns: GHNs) -> None:
     sizes = {"inputs": ghns.inputs, "outputs": ghns.outputs}
     # One entry, because safetensors writes several in an order that changes from run to run.
     note = {"nnit": json.dumps({"task": ghns.task, **sizes, "ghn_seeds": list(ghns.states)})}
-    write_atomically(path, lambda temporary: save_file(stacked, temporary, note))
+    write_bytes(path, save(stacked, note))
 
 
 def read(path: Path) -> GHNs:

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors.numpy import load_file as load_arrays
-from safetensors.numpy import save_file as save_arrays
+from safetensors.numpy import save as serialise
 from torch import Tensor
 
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
 from nnit_zoo.ghn import GHN
@@ -119,7 +119,7 @@ def gather_states(
 
 
 def _save_states(path: Path, states: Array) -> None:
-    write_atomically(path, lambda temporary: save_arrays({"states": states}, temporary))
+    write_bytes(path, serialise({"states": states}))
 
 
 def _students(ghn: GHN, fit: Fit, count: int) -> list[list[Array]]:

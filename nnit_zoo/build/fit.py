@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 from pydantic import BaseModel, ConfigDict
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from nnit_zoo.architecture import Architecture, architectures
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.ghn import GHN
 
 Loss = Callable[[Tensor, Tensor], Tensor]
@@ -99,5 +99,5 @@ def save_ghn(ghn: GHN, target: Path, *, seed: int, loss: float, **facts: int) ->
     """Store a GHN's state as float16 safetensors, with how it was made as metadata; returns a log line."""
     state = {name: tensor.half().contiguous() for name, tensor in ghn.state_dict().items()}
     note = {name: str(value) for name, value in {"seed": seed, "loss": loss, **facts}.items()}
-    write_atomically(target, lambda temporary: save_file(state, temporary, note))
+    write_bytes(target, save(state, note))
     return f"GHN {seed}: loss {loss:.4f}"

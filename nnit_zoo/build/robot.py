@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from nnit_zoo import stats
-from nnit_zoo.atomic import write_atomically, write_json
+from nnit_zoo.atomic import write_bytes, write_json
 from nnit_zoo.build import distill, twins
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.builder import Builder, log
@@ -68,7 +68,7 @@ class RobotBuilder(Builder):
             },
         )
         probe = torch.from_numpy(states[np.arange(PROBE_STATES) * len(states) // PROBE_STATES]).half()
-        write_atomically(self.data / PROBE, lambda temporary: save_file({"states": probe}, temporary))
+        write_bytes(self.data / PROBE, save({"states": probe}))
         experts.save(network, self.data / EXPERT)
         log(f"expert: {json.dumps(record)}")
         if not experts.good_enough(self.expert_config, record):

@@ -13,11 +13,11 @@ from typing import Any, Literal, get_args
 
 import torch
 from safetensors.numpy import load_file as load_arrays
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.build import expert as experts
 from nnit_zoo.build.distill import labelled
 from nnit_zoo.build.fit import Fit, FitConfig
@@ -53,7 +53,7 @@ def train(
     seed = int(target.stem)
     blocks, loss = (_emitted if kind == "GHN" else _trained)(task, config, inputs, labels, seed)
     tensors = {f"layers.{depth}": block.detach().contiguous() for depth, block in enumerate(blocks)}
-    write_atomically(target, lambda temporary: save_file(tensors, temporary))
+    write_bytes(target, save(tensors))
     return f"{kind} {seed}: loss {loss:.4f}"
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from torch import Tensor
 
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.sim import stock
@@ -168,7 +168,7 @@ def _scored(
         else:
             missing.append(unit)
     for unit, scores in unordered(play, missing, workers, parallel):
-        write_atomically(store / _key(task, unit), scores.tofile)
+        write_bytes(store / _key(task, unit), scores.tobytes())
         yield unit, scores
 
 

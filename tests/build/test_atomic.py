@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import os
+import resource
 
+import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 
-from nnit_zoo.atomic import write_atomically
+from nnit_zoo import ghn_file
+from nnit_zoo.atomic import write_atomically, write_bytes
+from nnit_zoo.build import distill, expert
+from nnit_zoo.build.fit import save_ghn
+from nnit_zoo.ghn import GHN
+from nnit_zoo.tasks.pick_cube import PickCube
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600)])
 def test_others_may_read_what_the_umask_lets_them(umask, mode, tmp_path):
     before = os.umask(umask)
     try:
-        write_atomically(tmp_path / "x", lambda path: save_file({"x": torch.zeros(1)}, path))
+        write_bytes(tmp_path / "x", b"")
     finally:
         os.umask(before)
     assert (tmp_path / "x").stat().st_mode & 0o777 == mode
@@ -29,4 +35,31 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
     (tmp_path / "x").write_bytes(b"old")
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "x", fail)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+
+
+@pytest.fixture
+def no_space():
+    """No file of this process may become longer than 8 bytes, as if the disk were full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+WRITERS = {
+    "an expert's training": lambda path: expert.Training(PickCube(), expert.ExpertConfig(hidden=8)).save(path),
+    "an expert": lambda path: expert.save([(np.zeros((2, 2), np.float32), np.zeros(2, np.float32))], path),
+    "states": lambda path: distill._save_states(path, np.zeros((2, 42), np.float32)),
+    "a GHN": lambda path: save_ghn(GHN(42, 8, 0), path, seed=0, loss=0.0),
+    "GHNs": lambda path: ghn_file.write(path, ghn_file.GHNs("PickCube-v1", 42, 8, {0: {"w": torch.zeros(9)}})),
+}
+
+
+@pytest.mark.parametrize("what", WRITERS)
+def test_a_full_disk_names_the_file_and_leaves_the_old_one(what, tmp_path, no_space):
+    path = tmp_path / "x"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match=str(path)):
+        WRITERS[what](path)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import time
@@ -17,7 +18,7 @@ from torch.optim.swa_utils import AveragedModel
 from nnit_baselines.generator import FitOptions
 from nnit_baselines.nnit.mixture import Mixture, Packed
 from nnit_baselines.nnit.model import Transformer
-from nnit_zoo.atomic import write_atomically, write_bytes
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.errors import UserError
 
 SAVE_SECONDS = 120.0
@@ -98,7 +99,9 @@ class Trainer:
         """Write the state, atomically."""
         parts = {name: getattr(self, name).state_dict() for name in ("model", "optimiser", "mean")}
         state = {**parts, "step": self.step, "seconds": self.seconds, "identity": self.identity()}
-        write_atomically(path, lambda temporary: torch.save(state, temporary))
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        write_bytes(path, buffer.getvalue())
 
     def load(self, path: Path) -> None:
         """Go on from a state; raises UserError if it is of another training."""
