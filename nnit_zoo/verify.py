@@ -22,8 +22,8 @@ ROUNDING = 1e-6  # of a mean of the same scores
 def verify(folder: Path, progress: Progress | None = None, splits: Collection[str] = files.SPLITS) -> list[str]:
     """What is wrong with the zoo in `folder`, a sentence per problem; empty if it is sound.
 
-    Only shards with policies of these splits are looked for. `progress` is called with the number of newly checked
-    shards. Raises UserError if the folder has no manifest that can be read.
+    Only shards with policies of these splits are looked for. `progress` is called with the number of newly done
+    shards, those that are not looked for at once. Raises UserError if the folder has no manifest that can be read.
     """
     manifest = files.Manifest.read(folder)
     if not manifest.index.describes(folder / files.INDEX):
@@ -41,6 +41,8 @@ def verify(folder: Path, progress: Progress | None = None, splits: Collection[st
     for name in sorted(rows.keys() - manifest.shards.keys()):
         problems.append(f"{folder / files.INDEX} lists policies in {name}, which {files.MANIFEST} does not")
     wanted = files.shards_of(index, splits)
+    if progress:
+        progress(len(manifest.shards.keys() - wanted))
     for name in (name for name in manifest.shards if name in wanted):
         entry = manifest.shards[name]
         architecture = Architecture.parse(Path(name).stem, manifest.inputs, manifest.outputs)

@@ -8,7 +8,7 @@ import shutil
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,7 +23,7 @@ from nnit_zoo.atomic import write_atomically, write_json
 from nnit_zoo.build.selection import SELECTION_SCHEMA, is_yardstick, select
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import CANDIDATE_EPISODES, GHNS, SELECTION
+from nnit_zoo.files import CANDIDATE_EPISODES, GHNS, INDEX, MANIFEST, SELECTION
 from nnit_zoo.ghn import GHN
 from nnit_zoo.materialise import stored, write_manifest
 from nnit_zoo.parallel import Backend, unordered
@@ -118,7 +118,7 @@ class Builder(ABC):
         )
 
     def pack(self) -> None:
-        """Select per architecture by the thresholds, and write the zoo with its GHNs and scores to the data folder."""
+        """Select per architecture by the thresholds, and put the zoo, once whole, with its GHNs and scores in place."""
         self._require_ghns()
         rows: list[dict[str, Any]] = []
         tables: list[pa.Table] = []
@@ -130,18 +130,15 @@ class Builder(ABC):
                 tables.append(table)
                 rows += select(self.task, split, str(architecture), table)
         states = {seed: load_file(self._ghn(seed)) for seed in self.seeds}
-        ghn_file.write(self.data / GHNS, ghn_file.GHNs(self.task.name, *self._sizes, states))
-        write_atomically(
-            self.data / CANDIDATE_EPISODES,
-            lambda temporary: pq.write_table(pa.concat_tables(tables), temporary, compression="zstd"),
-        )
-        write_atomically(
-            self.data / SELECTION,
-            lambda temporary: pq.write_table(
-                pa.Table.from_pylist(rows, SELECTION_SCHEMA), temporary, compression="zstd"
-            ),
-        )
-        write_manifest(self.data, self.task.standardisation)
+        whole = self.work / "pack"
+        whole.mkdir(exist_ok=True)
+        ghn_file.write(whole / GHNS, ghn_file.GHNs(self.task.name, *self._sizes, states))
+        pq.write_table(pa.concat_tables(tables), whole / CANDIDATE_EPISODES, compression="zstd")
+        pq.write_table(pa.Table.from_pylist(rows, SELECTION_SCHEMA), whole / SELECTION, compression="zstd")
+        write_manifest(whole, self.task.standardisation)
+        for name in (GHNS, CANDIDATE_EPISODES, SELECTION, INDEX, MANIFEST):
+            write_atomically(self.data / name, partial(shutil.copyfile, whole / name))
+        shutil.rmtree(whole)
         seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]
         passed, kept = (sum(row[name] for row in seen) for name in ("passed", "kept"))
         record = json.loads((self.data / "task.json").read_text())

@@ -43,7 +43,7 @@ def build(
     Args:
         task: Name of the task.
         stage: Only this stage, of those that the task has.
-        seeds: GHNs; by default as many as the zoo that ships was made by, or 16.
+        seeds: GHNs; by default as many as the zoo that ships was made by, or as there are in the work folder, or 16.
         workers: Processes that train and score.
         parallel: Where candidates are scored: on this machine, or on a Ray cluster.
         work: Folder of intermediate states; a killed build resumes from it.
@@ -54,13 +54,14 @@ def build(
     if workers < 1 or (seeds is not None and seeds < 1):
         raise UserError("--workers and --seeds must be 1 or more")
     shipped = data_folder(task) / SELECTION
-    least = ghns_of(shipped) if shipped.exists() else 0
-    seeds = seeds or least or 16
-    if seeds < least:
-        raise UserError(
-            f"the zoo of {task} in {shipped.parent} was made by {least} GHNs, and one of {seeds} would replace it; "
-            "move it elsewhere first if that is meant"
-        )
+    packed, made = ghns_of(shipped) if shipped.exists() else 0, len(list((work / task / "ghns").glob("*.safetensors")))
+    seeds = seeds or max(packed, made) or 16
+    for there, what, place in ((packed, "zoo", shipped.parent), (made, "scores", work / task)):
+        if seeds < there:
+            raise UserError(
+                f"{place} has {there} GHNs of {task}, and the {what} of {seeds} would take the place of theirs; "
+                "move it elsewhere first if that is meant"
+            )
     builder: Builder
     if isinstance(chosen, RobotPolicyTask) and source is None:
         require_simulator()

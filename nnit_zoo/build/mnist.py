@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
+import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,14 +18,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from safetensors.numpy import save_file as save_arrays
+from safetensors.numpy import save as serialise
 from torch import nn
 
-from nnit_zoo.atomic import write_atomically, write_json
+from nnit_zoo.atomic import write_atomically, write_bytes, write_json
 from nnit_zoo.build.builder import Builder, log
 from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import sha256_of
+from nnit_zoo.files import MANIFEST, sha256_of
 from nnit_zoo.ghn import GHN
 from nnit_zoo.parallel import Backend
 from nnit_zoo.provenance import commit
@@ -85,10 +87,13 @@ def _read_idx(folder: Path, name: str) -> Bytes:
     path = next((path for path in (folder / name, folder / f"{name}.gz") if path.is_file()), None)
     if path is None:
         raise UserError(f"there is no {name} or {name}.gz in {folder}")
-    content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    axes = content[3]
-    shape = np.frombuffer(content, ">u4", axes, offset=4)
-    return np.frombuffer(content, np.uint8, offset=4 + 4 * axes).reshape(shape)
+    try:
+        content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+        axes = content[3]
+        shape = np.frombuffer(content, ">u4", axes, offset=4)
+        return np.frombuffer(content, np.uint8, offset=4 + 4 * axes).reshape(shape)
+    except (OSError, EOFError, IndexError, ValueError, zlib.error) as error:
+        raise UserError(f"{path} cannot be read ({error}); fetch it again") from None
 
 
 def fit_pca(images: Bytes, components: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
@@ -125,7 +130,7 @@ def build_features(source: str, target: Path) -> tuple[dict[str, list[float]], d
     tensors: dict[str, npt.NDArray[Any]] = {"mean": mean, "components": components}
     for part, (pictures, labels) in digits.items():
         tensors |= {f"{part}.features": project(pictures, mean, components), f"{part}.labels": labels}
-    write_atomically(target, lambda temporary: save_arrays(tensors, temporary))
+    write_bytes(target, serialise(tensors))
     squares = tensors["train.features"].astype(np.float64) ** 2
     scale = float(np.float32(np.sqrt(squares.mean())))
     constants = {"observation_mean": [0.0] * len(components), "observation_std": [scale] * len(components)}
@@ -176,7 +181,14 @@ class MNISTBuilder(Builder):
             log("features: done")
             return
         earlier = json.loads(target.read_text())["build"] if target.exists() else {}
-        constants, facts = build_features(self.source, self.data / FEATURES)
+        made = self.work / "features" / FEATURES
+        constants, facts = build_features(self.source, made)
+        if (self.data / MANIFEST).exists() and sha256_of(made) != sha256_of(self.data / FEATURES):
+            raise UserError(
+                f"the zoo of {self.task.name} in {self.data} was made for other features than those of {self.source}; "
+                "move it elsewhere first if another is meant"
+            )
+        write_atomically(self.data / FEATURES, partial(shutil.copyfile, made))
         content = {"name": self.task.name, "version": self.task.version, **constants}
         write_json(target, {**content, "build": {**earlier, "features": {**facts, "commit": str(commit())}}})
         log(f"features: {json.dumps(facts)}")

@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -165,6 +166,18 @@ def test_networks_for_digits_are_scored_where_the_user_says(builder, tmp_path, m
     command.build(stage="ghns", workers=1, **options)
     command.build(stage="scores", workers=3, parallel="ray", **options)
     assert asked == [(3, "ray")] * 4
+
+
+def test_a_build_that_goes_on_keeps_to_the_ghns_that_are_there(builder, tmp_path, monkeypatch):
+    monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
+    builder(tmp_path, "MNIST-PCA32")
+    options = {"task": "MNIST-PCA32", "workers": 1, "work": tmp_path}
+    command.build(stage="ghns", seeds=3, **options)
+    command.build(stage="scores", **options)
+    scores = tmp_path / "MNIST-PCA32" / "scores" / "16-16-16-32.parquet"
+    assert set(pq.read_table(scores)["ghn_seed"].to_pylist()) == {0, 1, 2}
+    with pytest.raises(UserError, match="has 3 GHNs of MNIST-PCA32, and the scores of 2 would take the place of"):
+        command.build(stage="scores", seeds=2, **options)
 
 
 def test_features_are_made_from_the_named_source_and_keep_the_record_of_the_zoo(builder, tmp_path):
@@ -333,9 +346,16 @@ def test_a_zoo_is_in_place_until_another_is_whole_and_not_replaced_by_a_smaller_
     more.seeds = range(3)
     more.ghns()
     more.scores()
+    with monkeypatch.context() as killing:
+        killing.setattr(common, "write_manifest", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            more.pack()
     assert artifacts(tmp_path) == before
+    sample = Path(__file__).parents[1] / "zoo" / "mnist"
+    with pytest.raises(UserError, match="was made for other features"):
+        builder(tmp_path, "MNIST-PCA32", source=str(sample)).features()
     monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
-    with pytest.raises(UserError, match="was made by 2 GHNs, and one of 1 would replace it"):
+    with pytest.raises(UserError, match="has 2 GHNs of MNIST-PCA32, and the zoo of 1 would take the place of theirs"):
         command.build(task="MNIST-PCA32", seeds=1, work=tmp_path)
 
 

@@ -97,7 +97,16 @@ def test_digits_come_from_plain_files_too_and_missing_ones_are_named(tmp_path: P
         (tmp_path / path.stem).write_bytes(gzip.decompress(path.read_bytes()))
     ours, theirs = mnist.read_digits(str(tmp_path)), mnist.read_digits(str(SAMPLE))
     assert all(np.array_equal(ours[part][index], theirs[part][index]) for part in ours for index in (0, 1))
-    (tmp_path / "t10k-labels-idx1-ubyte").unlink()
+    cut = tmp_path / "t10k-labels-idx1-ubyte"
+    for content in (cut.read_bytes()[:-1], cut.read_bytes()[:3]):
+        cut.write_bytes(content)
+        with pytest.raises(UserError, match=r"t10k-labels-idx1-ubyte cannot be read .*; fetch it again"):
+            mnist.read_digits(str(tmp_path))
+    (tmp_path / f"{cut.name}.gz").write_bytes(gzip.compress(b"digits")[:-9])
+    cut.unlink()
+    with pytest.raises(UserError, match=r"t10k-labels-idx1-ubyte\.gz cannot be read .*; fetch it again"):
+        mnist.read_digits(str(tmp_path))
+    (tmp_path / f"{cut.name}.gz").unlink()
     with pytest.raises(UserError, match="no t10k-labels-idx1-ubyte or"):
         mnist.read_digits(str(tmp_path))
 
