@@ -78,8 +78,9 @@ def differ(first: StoredRun, second: StoredRun) -> list[Difference]:
     """The differences of two runs' scores, over the architectures and episodes that both have.
 
     Of `mean`, architectures with their policies are drawn for both methods together, and so are episodes; on `joint`
-    each method's policies are drawn for themselves. Of the `top` ones, which are given, only episodes. Raises
-    Incomparable if they were not measured alike, or share no architecture or episode.
+    each method's policies are drawn for themselves. Of the `top` ones, which are given, only episodes; these are left
+    out unless both runs have as many policies of the same architectures. Raises Incomparable if the two were not
+    measured alike, or share no architecture or episode.
     """
     ours = first.record.protocol
     parts = {"mean": _everything(first, second)}
@@ -121,7 +122,9 @@ def _everything(first: StoredRun, second: StoredRun) -> tuple[Scores, Scores]:
 
 
 def _picked(first: StoredRun, second: StoredRun) -> dict[str, tuple[Scores, Scores]]:
-    """The selected policies of both, for each kind of selection that both have."""
+    """The selected policies of both, for each kind of selection that both have; none if they chose among other ones."""
+    if first.record.protocol.policies != second.record.protocol.policies:
+        return {}
     mine, other = (scores.selected(run.episodes, run.record.protocol) for run in (first, second))
     return {
         name: (mine[name], other[name])

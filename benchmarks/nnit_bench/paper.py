@@ -245,8 +245,9 @@ def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> Store
         table.notes.append(f"with {', '.join(run.given)}: {name} on {task}, {split}")
     if run and run.is_shipped:
         table.notes.append(f"shipped, not run here: {name} on {task}, {split}")
-    if run and name == "NNiT" and run.record.method.training.get("preset") != "paper":
-        table.notes.append("NNiT, here: preset cpu, not the objective of the paper (docs/nnit.md)")
+    if run and name == "NNiT" and (preset := run.record.method.training.get("preset")) != "paper":
+        settings = f"preset {preset}" if preset else "settings of its own"
+        table.notes.append(f"NNiT, here: {settings}, not the paper's (docs/nnit.md)")
     return run
 
 

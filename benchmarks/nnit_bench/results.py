@@ -59,6 +59,8 @@ class StoredRun:
         protocol, words = self.record.protocol, []
         if protocol.simulator not in (None, "fast"):
             words.append(f"on {protocol.simulator}")
+        if protocol.selection != "heldout":
+            words.append(f"protocol {protocol.selection}")
         if protocol.seed != 0:
             words.append(f"seed {protocol.seed}")
         if steps := self.record.method.given.get("sampling_steps"):
@@ -89,14 +91,14 @@ def find(folders: Iterable[Path]) -> list[StoredRun]:
 def latest(runs: Iterable[StoredRun]) -> dict[tuple[str, str, str], StoredRun]:
     """(task, split, method) -> its run.
 
-    In this order: a whole one, with the benchmark's settings (whatever its checkpoint), of the newest version of the
-    task, of the most episodes, the newest, one's own.
+    In this order: one with results, a whole one, with the benchmark's settings (whatever its checkpoint), of the newest
+    version of the task, of the most episodes, the newest, one's own.
     """
 
-    def rank(run: StoredRun) -> tuple[bool, bool, int, int, datetime, bool]:
+    def rank(run: StoredRun) -> tuple[bool, bool, bool, int, int, datetime, bool]:
         protocol = run.record.protocol
         newest = protocol.task_version, protocol.select.count, run.record.started
-        return run.is_whole, not run.departures, *newest, not run.is_shipped
+        return run.record.results is not None, run.is_whole, not run.departures, *newest, not run.is_shipped
 
     ranked = sorted(runs, key=rank)
     return {(run.record.protocol.task, run.record.protocol.split, run.record.method.name): run for run in ranked}

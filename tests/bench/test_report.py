@@ -17,7 +17,7 @@ import pytest
 from nnit_bench import paper, results, tables
 from nnit_bench.protocol import Protocol, SeedRange
 from nnit_bench.records import Distance, Novelty
-from nnit_bench.report import report
+from nnit_bench.report import _by_architecture, report
 from nnit_bench.results import StoredRun
 from nnit_bench.runner import Outcome
 from nnit_bench.statistics import Estimate
@@ -35,8 +35,8 @@ def outcomes(level: float, policies: int, seed: int = 0) -> np.ndarray:
 
 @pytest.fixture
 def pick(task: Any) -> Protocol:
-    """A protocol like PickCube's."""
-    return Protocol.of(task, "unseen", selection="paper", episodes=10).model_copy(update={"task": "PickCube-v1"})
+    """A protocol like PickCube's, without its second phase."""
+    return Protocol.of(task, "unseen", episodes=10).model_copy(update={"task": "PickCube-v1", "report": None})
 
 
 def joint_of(protocol: Protocol) -> Protocol:
@@ -109,6 +109,12 @@ def test_a_run_with_settings_of_its_own_does_not_stand_for_the_method_and_is_mar
     chosen = results.latest(results.find([tmp_path]))["PickCube-v1", "unseen", "nnit"]
     assert chosen.folder.resolve() == usual.folder.resolve()
 
+    store("nnit", pick.model_copy(update={"selection": "paper"}), outcomes(0.9, 80))
+    refused = store("nnit", pick, outcomes(0.9, 80), zoo="another")
+    refused.record.model_copy(update={"results": None}).stop(refused.folder, "unsupported", "it cannot")
+    chosen = results.latest(results.find([tmp_path]))["PickCube-v1", "unseen", "nnit"]
+    assert chosen.folder.resolve() == usual.folder.resolve()
+
     own = store("nnit", pick, outcomes(0.9, 80), given={"checkpoint": "runs/mine"}, zoo="newer")
     chosen = results.latest(results.find([tmp_path]))["PickCube-v1", "unseen", "nnit"]
     assert chosen.folder.resolve() == own.folder.resolve()
@@ -126,6 +132,13 @@ def test_without_matplotlib_there_are_tables(
     report(folders=(tmp_path,), output=tmp_path / "without")
     assert "pip install 'nnit[figures]'" in capsys.readouterr().err
     assert sorted(path.name for path in (tmp_path / "without").iterdir()) == ["report.csv", "report.json", "report.md"]
+
+
+def test_the_figure_has_the_architectures_of_all_runs(store: Store, pick: Protocol) -> None:
+    """The best run may be one of a single architecture."""
+    one = store("crop", pick.model_copy(update={"policies": {"16-64-64-32": 10}}), outcomes(1.0, 10))
+    axes = _by_architecture([one, store("nnit", pick, outcomes(0.5, 80))]).axes[0]
+    assert [label.get_text() for label in axes.get_xticklabels()] == list(pick.policies)
 
 
 def test_ties_are_told_for_every_pair_that_can_be_compared(store: Store, pick: Protocol, tmp_path: Path) -> None:
