@@ -43,7 +43,7 @@ class Source:
             self._hub = HfFileSystem(skip_instance_cache=True)  # what the Hub holds may change
             root = address.removeprefix("hf://") if address.startswith("hf://") else f"datasets/{address}"
         self._folder = f"{root}/{task}"
-        with _explained(self.address):
+        with explained(self.address):
             try:
                 content = self._read(MANIFEST)
             except (FileNotFoundError, EntryNotFoundError):
@@ -66,7 +66,7 @@ class Source:
 
     def read(self, name: str) -> bytes:
         """The content of one of the zoo's files; raises UserError if it cannot be read."""
-        with _explained(self.address):
+        with explained(self.address):
             return self._read(name)
 
     @cached_property
@@ -100,7 +100,7 @@ def push(repository: str, folder: Path) -> str:
 
     Raises UserError if it holds other zoos, which the new README would not list, or if the Hub refuses.
     """
-    with _explained(repository):
+    with explained(repository):
         hub = HfApi()
         hub.create_repo(repository, repo_type="dataset", exist_ok=True)
         there = [PurePosixPath(each.rfilename) for each in hub.dataset_info(repository).siblings or ()]
@@ -111,7 +111,7 @@ def push(repository: str, folder: Path) -> str:
 
 
 @contextmanager
-def _explained(address: str) -> Iterator[None]:
+def explained(address: str) -> Iterator[None]:
     """What the Hub's client raises becomes a UserError that says what to do."""
     try:
         yield
@@ -122,7 +122,7 @@ def _explained(address: str) -> Iterator[None]:
     except LocalTokenNotFoundError:
         raise UserError("the Hub wants to know who you are; log in with: hf auth login") from None
     except (FileNotFoundError, EntryNotFoundError, NotImplementedError, ValueError) as error:
-        raise UserError(f"no such zoo in {address}: {error}") from None
+        raise UserError(f"nothing of that kind in {address}: {error}") from None
     except HfHubHTTPError as error:
         raise UserError(f"the Hub refuses {address}: {error}; log in with: hf auth login") from None
     except httpx2.HTTPError as error:

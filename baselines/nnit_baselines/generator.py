@@ -19,8 +19,9 @@ from torch import Tensor
 
 from nnit_baselines.card import card
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.atomic import write_atomically, write_bytes, write_json
+from nnit_zoo.atomic import write_bytes, write_json
 from nnit_zoo.errors import UserError
+from nnit_zoo.hub import explained
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.zoo import TrainingView
 
@@ -155,7 +156,7 @@ class Generator(ABC):
         if taken := sorted(config.keys() & own.keys()):
             raise UserError(f"config() of {kind.__name__} has the reserved key {taken[0]}; give it another name")
         config, tensors = config | own, self.tensors()
-        write_atomically(folder / WEIGHTS, lambda path: safetensors.torch.save_file(tensors, path, METADATA))
+        write_bytes(folder / WEIGHTS, safetensors.torch.save(tensors, METADATA))
         write_json(folder / CONFIG, config)
         text = card(
             kind.__name__,
@@ -189,8 +190,11 @@ class Generator(ABC):
         return generator
 
     def push_to_hub(self, repo_id: str) -> str:
-        """Upload the checkpoint to a model repository of the Hub, made if needed; returns the address of the commit."""
-        with tempfile.TemporaryDirectory() as folder:
+        """Upload the checkpoint to a model repository of the Hub, made if needed; returns the address of the commit.
+
+        Raises UserError if the Hub refuses.
+        """
+        with tempfile.TemporaryDirectory() as folder, explained(repo_id):
             self.save_pretrained(folder)
             hub = HfApi()
             hub.create_repo(repo_id, exist_ok=True)

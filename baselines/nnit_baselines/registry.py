@@ -82,10 +82,12 @@ def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None, s
     """The generator called `name`, ready to sample networks of `split` for the zoo's task.
 
     A trained method is read from `source`, by default from its shipped checkpoint; others are fitted here, with `seed`.
-    Raises UserError if there is no checkpoint, or it is for another task.
+    Raises UserError if there is no checkpoint, or it is for another task, or `source` is given for one that takes none.
     """
     kind = get(name)
     if not kind.capabilities.checkpoint:
+        if source is not None:
+            raise UserError(f"{name} has no checkpoint, as it needs no training: leave --checkpoint out")
         generator = kind()
         generator.fit(
             zoo.reference_view(split) if kind.capabilities.oracle else zoo.training_view(), FitOptions(seed=seed)
@@ -132,10 +134,17 @@ def address(kind: type[Generator]) -> str:
 
 def _run_file(path: Path) -> Any:
     place = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:8]  # files of one name are modules of two
-    spec = importlib.util.spec_from_file_location(f"{FILE_MODULE}{path.stem}_{place}", path)
+    name = f"{FILE_MODULE}{path.stem}_{place}"
+    if name in sys.modules:  # like any module, it is loaded once
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None or not path.is_file():
         raise UserError(f"no such file: {path}")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look up their annotations
-    spec.loader.exec_module(module)
+    sys.modules[name] = module  # where dataclasses look up their annotations
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
     return module

@@ -7,28 +7,32 @@ from pathlib import Path
 
 import torch
 
-import nnit_zoo
 from nnit_baselines.generator import FitOptions, Generator
 from nnit_baselines.registry import get
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import MANIFEST, sha256_of
 from nnit_zoo.provenance import commit
+from nnit_zoo.zoo import Zoo
 
 
-def train(
-    method: str, task: str, options: FitOptions, output: Path, zoo_folder: Path | None = None, preset: str | None = None
-) -> Generator:
-    """Fit `method` on the task's training view and write config.json, model.safetensors and README.md to `output`.
+def untrained(method: str, preset: str | None = None) -> Generator:
+    """A generator called `method` for `train`, with the settings of that preset, or else its own.
 
-    An interrupted run goes on from `options.folder`. Raises UserError for an unknown method or preset, a method that
-    needs no training, or a missing zoo.
+    Raises UserError for an unknown method or preset, or a method that needs no training.
     """
     kind = get(method)
     if not kind.capabilities.checkpoint:
         raise UserError(f"{method} needs no training; run: nnit-bench run --method {method}")
-    zoo = nnit_zoo.load(task, zoo_folder)
+    return kind() if preset is None else kind.from_preset(preset)
+
+
+def train(generator: Generator, zoo: Zoo, options: FitOptions, output: Path, preset: str | None = None) -> None:
+    """Fit on the zoo's training view and write config.json, model.safetensors and README.md to `output`.
+
+    An interrupted run goes on from `options.folder`. The record of the training names `preset`.
+    """
+    output.mkdir(parents=True, exist_ok=True)  # what cannot be written to is told before the work
     view = zoo.training_view()
-    generator = kind() if preset is None else kind.from_preset(preset)
     generator.fit(view, options)
     generator.training_facts = {
         **generator.training_facts,
@@ -42,4 +46,3 @@ def train(
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
     }
     generator.save_pretrained(output)
-    return generator

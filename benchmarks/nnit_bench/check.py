@@ -283,6 +283,9 @@ def _honest(subject: Subject) -> None:
         if not supported:
             raise Broken(f"it made {text}, which it says that it does not support")
         _check_batch("sample", batch)
+        if batch.architecture != architecture or len(batch) != 2:
+            gave = _shown([(batch.architecture, len(batch))])
+            raise Broken(f"sample was asked for {_shown([(architecture, 2)])}, and gave {gave}")
 
 
 @clause(

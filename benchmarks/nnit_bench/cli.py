@@ -111,7 +111,7 @@ def run(
     from nnit_zoo.display import Display
 
     for name in method:
-        registry.get(name)  # a wrong name is told now, not after the work for the names before it
+        runner.code_of(registry.get(name))  # a wrong name is told now, and what a file holds now is what counts
     if checkpoint and len(method) * len(task) > 1:
         raise UserError("--checkpoint belongs to one --method and one --task")
     if execution.workers < 1:
@@ -166,7 +166,7 @@ def train(
         trackio: Project of trackio that the training's log also goes to, live; needs the extra `trackio`.
         quiet: Print no progress and no notes.
     """
-    from nnit_baselines import registry, training
+    from nnit_baselines import training
     from nnit_baselines.generator import FitOptions
     from nnit_bench.records import folder_name
     from nnit_zoo import tasks
@@ -175,14 +175,14 @@ def train(
     if steps is not None and steps < 1:
         raise UserError(f"--steps must be 1 or more, not {steps}")
     task = tasks.get(task).name
-    registry.get(method)
+    generator = training.untrained(method, preset)  # a wrong name is told before the zoo is made
     folder = output or Path("runs") / folder_name(method) / task
     screen = Display(quiet)
     zoo = _zoo(task, screen)
     name = f"{folder_name(method)}-{task}-{seed}"
     with _tracking(trackio, name) as track, screen.steps(f"training {method}") as progress:
         options = FitOptions(steps=steps, seed=seed, folder=folder / "state", progress=progress, track=track)
-        training.train(method, task, options, folder, zoo.folder, preset)
+        training.train(generator, zoo, options, folder, preset)
     sys.stdout.write(f"{folder}\n")
     screen.note(f"score it with: nnit-bench run --method {method} --task {task} --checkpoint {folder}")
 

@@ -96,6 +96,7 @@ def plugin_files(module: str) -> dict[str, Path]:
     return {str(path.relative_to(file.parent)): path for path in found.values()}
 
 
+@cache  # files that change while a command runs are not what runs
 def this_code(plugin: str | None = None) -> Code:
     """The code that is running, with the module of a method that is not one of ours."""
     ours = _our_code()
@@ -105,7 +106,7 @@ def this_code(plugin: str | None = None) -> Code:
     return replace(ours, sha256=total.hexdigest())
 
 
-@cache  # what was loaded: files that change while a command runs are not what runs
+@cache
 def _our_code() -> Code:
     files: dict[str, Path] = {}
     for package in OUR_PACKAGES:

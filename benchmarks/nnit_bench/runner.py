@@ -81,8 +81,7 @@ def enter(
     """The entry of the method `name`, with what identifies it; raises UserError if it cannot be loaded or fitted."""
     start = time.perf_counter()
     kind = registry.get(name)
-    ours = kind.__module__.partition(".")[0] in OUR_PACKAGES
-    code = this_code(None if ours else kind.__module__)
+    code = code_of(kind)
     options = {"checkpoint": checkpoint, "sampling_steps": sampling_steps}
     given = {key: value for key, value in options.items() if value is not None}
     able = kind.capabilities
@@ -98,6 +97,12 @@ def enter(
         set_sampling_steps(name, generator, sampling_steps)
     method = describe(name, generator, given)
     return Entry(method, code, generator, _lacks(generator, zoo, protocol), time.perf_counter() - start)
+
+
+def code_of(kind: type[Generator]) -> Code:
+    """The code of a loaded method, as it was when this was first asked."""
+    ours = kind.__module__.partition(".")[0] in OUR_PACKAGES
+    return this_code(None if ours else kind.__module__)
 
 
 def describe(name: str, generator: Generator, given: dict[str, Any]) -> Method:
@@ -185,6 +190,7 @@ def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:
         return None
     record = RunRecord.read(folder)
     if record.status in ("success", "unsupported"):
+        shutil.rmtree(folder / UNITS, ignore_errors=True)  # left by a kill at the very end
         counts = zeroed(records.read_episodes(folder)) if record.status == "success" else {}
         return Outcome(record, folder, reused=True, zeroed=counts)
     if overwrite == "never":

@@ -195,6 +195,16 @@ class ScalesTheZoo(Good):
         view.batches[view.architectures[0]].layers[0].mul_(2)
 
 
+class AnswersWithAnother(Good):
+    """Asked for widths that it does not know, it gives others; so it seems to support all."""
+
+    capabilities = Capabilities(depths=(4,))
+
+    def sample(self, request):
+        known = request.architecture if set(request.architecture.hidden) <= {16, 32, 64} else self.known[0]
+        return self.fresh(known, request.policies, torch.Generator().manual_seed(request.seed))
+
+
 class Overclaims(Good):
     capabilities = Capabilities()
 
@@ -295,6 +305,7 @@ class KeepsNothing(Good):
         (SeedsGlobally, "fit used the global random numbers"),
         (ScalesTheZoo, "fit changed the view's policies"),
         (Overclaims, "supports 16-16-16-32, but sample answers: not that one"),
+        (AnswersWithAnother, "sample was asked for 2 of 24-16-40-24, and gave 2 of"),
         (Underclaims, "it made 24-16-40-24, which it says that it does not support"),
         (DisownsTheZoo, "does not support 64-64-64-64, an architecture that it was fitted on"),
         (Crashes, r"AttributeError.*nonsense.*\(test_check.py, line"),

@@ -12,7 +12,8 @@ import pytest
 
 from nnit_baselines import registry
 from nnit_baselines.nnit.config import PRESETS, NNiTConfig
-from nnit_bench import cli
+from nnit_bench import cli, runner
+from nnit_bench.provenance import this_code
 from nnit_zoo import places, tasks
 from nnit_zoo.architecture import hidden_widths
 from nnit_zoo.errors import UserError
@@ -46,6 +47,13 @@ def fresh(task: Any, embed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     get = tasks.get
     monkeypatch.setattr(tasks, "get", lambda name: task if name == task.name else get(name))
     return tmp_path / "results"
+
+
+def as_in_a_new_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget the plug-ins that this process has loaded, and what it knows of their code."""
+    for name in [name for name in sys.modules if name.startswith((registry.FILE_MODULE, "my_"))]:
+        monkeypatch.delitem(sys.modules, name)
+    this_code.cache_clear()
 
 
 def test_a_fresh_machine_gets_its_zoo_and_its_table(
@@ -104,23 +112,43 @@ def test_json_is_all_that_stdout_holds(
 
 
 def test_a_changed_plug_in_is_run_again(
-    call: Call, fresh: Path, plugin: Path, capsys: pytest.CaptureFixture[str]
+    call: Call, fresh: Path, plugin: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So is one with a change in a file beside it that it imports, and only such a one."""
     beside = plugin.parent / "my_helper.py"
-    beside.write_text("SCALE = 1\n")
-    plugin.write_text("from my_helper import SCALE\n" + plugin.read_text())
-    what = ["--task", "Formula-v1", "--episodes", "2", "--policies", "1", "--output", fresh]
-    assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
-    plugin.write_text(plugin.read_text().replace("torch.zeros", "torch.ones"))
-    assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
-    beside.write_text("SCALE = 2\n")
-    assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
-    assert "had finished before" not in capsys.readouterr().err
-    (plugin.parent / "another.py").write_text("SCALE = 3\n")
-    assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
-    assert "had finished before" in capsys.readouterr().err
-    assert len(list(fresh.rglob("run.json"))) == 3
+    changes = (
+        lambda: beside.write_text("BIAS = 0\n"),
+        lambda: beside.write_text("BIAS = 1\n"),
+        lambda: plugin.write_text(plugin.read_text().replace("BIAS +", "2 * BIAS +")),
+        lambda: (plugin.parent / "another.py").write_text("BIAS = 3\n"),
+    )
+    plugin.write_text(
+        "from my_helper import BIAS\n" + plugin.read_text().replace("torch.zeros(", "BIAS + torch.zeros(")
+    )
+    returns = []
+    for change in changes:
+        change()
+        as_in_a_new_process(monkeypatch)
+        what = ["--task", "Formula-v1", "--episodes", "2", "--policies", "1", "--output", fresh, "--json"]
+        assert call("run", "--method", f"{plugin}:Zeros", *what) == 0
+        (run,) = json.loads(capsys.readouterr().out)["tables"][0]["runs"]
+        returns.append((run["results"]["estimates"]["return"]["mean"]["value"], run["reused"]))
+    assert returns == [(0, False), (40, False), (80, False), (80, True)]
+
+
+def test_what_a_plug_ins_files_held_when_the_command_began_is_what_counts(
+    plugin: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (plugin.parent / "my_helper.py").write_text("BIAS = 0\n")
+    plugin.write_text("from my_helper import BIAS\n" + plugin.read_text())
+    as_in_a_new_process(monkeypatch)
+    kind = registry.get(f"{plugin}:Zeros")
+    before = runner.code_of(kind)
+    for path in plugin.parent.glob("my_*.py"):
+        path.write_text(path.read_text() + "NEW = 1\n")
+    assert registry.get(f"{plugin}:Zeros") is kind and runner.code_of(kind) == before
+    as_in_a_new_process(monkeypatch)
+    assert runner.code_of(registry.get(f"{plugin}:Zeros")) != before
 
 
 def test_a_plug_in_is_not_scored_with_the_code_of_another(
@@ -135,10 +163,9 @@ def test_a_plug_in_is_not_scored_with_the_code_of_another(
         copy.write_text("from its_scale import SCALE\n" + plugin.read_text())
         addresses.append(f"{copy}:Zeros")
     what = ["--task", "Formula-v1", "--episodes", "2", "--policies", "1", "--output", fresh]
-    assert call("run", "--method", ",".join(addresses), *what) == 1
-    out, err = capsys.readouterr()
-    assert "its_scale.py of that name is loaded; use a command for each of them" in err
-    assert out.count("my_method.py:Zeros") > 0 and len(list(fresh.rglob("run.json"))) == 1
+    assert call("run", "--method", ",".join(addresses), *what) == 2
+    assert "its_scale.py of that name is loaded; use a command for each of them" in capsys.readouterr().err
+    assert not fresh.exists()
 
 
 def test_a_crash_in_a_plug_in_does_not_cost_the_others(
@@ -229,6 +256,28 @@ def test_mistakes_are_answered(
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ") and message in err and "Traceback" not in err
+
+
+def test_what_needs_no_training_takes_no_checkpoint(
+    call: Call, fresh: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call("run", "--task", "Formula-v1", "--method", "crop", "--checkpoint", "mine", "--output", fresh) == 1
+    assert "crop has no checkpoint, as it needs no training: leave --checkpoint out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--method", "crop"], "crop needs no training; run: nnit-bench run --method crop"),
+        (["--preset", "papers"], "no preset of nnit named 'papers'"),
+    ],
+)
+def test_a_training_that_cannot_be_is_refused_before_any_work(
+    call: Call, fresh: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call("train", "--task", "Formula-v1", "--output", fresh, *arguments) == 2
+    err = capsys.readouterr().err
+    assert message in err and "making the zoo" not in err
 
 
 def test_a_damaged_shard_is_answered(

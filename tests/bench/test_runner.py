@@ -200,6 +200,13 @@ def test_a_full_disk_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         run()
 
 
+def test_what_a_kill_at_the_very_end_leaves_is_cleared(run: Run) -> None:
+    left = run().folder / runner.UNITS / "unit"
+    left.parent.mkdir()
+    left.touch()
+    assert run().reused and not left.parent.exists()
+
+
 def test_a_damaged_record_is_told(run: Run) -> None:
     (run().folder / "run.json").write_text('{"schema_version": 1, "run_id"')
     with pytest.raises(UserError, match=r"run\.json is damaged"):

@@ -110,7 +110,7 @@ def test_a_manifest_cannot_write_outside_its_folder(hub, tmp_path: Path) -> None
     [
         ("someone/zo", None, "PickCube-v1", "someone/zo"),
         ("someone/zoo", "v9", "PickCube-v1", "zoo@v9: .*revision not found"),
-        ("someone/zoo", None, "PushCube-v1", "no such zoo in someone/zoo"),
+        ("someone/zoo", None, "PushCube-v1", "nothing of that kind in someone/zoo"),
         ("nobody", None, "PickCube-v1", "nobody"),
         ("./nowhere", None, "PickCube-v1", "no folder ./nowhere"),
         (".", "main", "PickCube-v1", "leave out --revision"),
