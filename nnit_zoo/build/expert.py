@@ -272,7 +272,8 @@ def train(
 ) -> dict[str, Any]:
     """Train until the stopping scores or `total_steps`; `folder` gets the state, a log and the best expert.
 
-    Returns the record of the best expert: its deterministic scores over 200 episodes, steps and seconds.
+    Returns the record of the best expert, which reaches these scores or else has the highest return: its deterministic
+    scores over 200 episodes, and steps.
     """
     folder.mkdir(parents=True, exist_ok=True)
     training = Training(task, config)
@@ -291,7 +292,7 @@ def train(
         log(f"expert {json.dumps(entry)} ({time.monotonic() - started:.1f} s)")
         with (folder / "log.jsonl").open("a") as lines:
             lines.write(json.dumps(entry) + "\n")
-        if scores["return"] > training.best_return:
+        if good_enough(config, entry) or scores["return"] > training.best_return:
             training.best_return = scores["return"]
             save(network, folder / EXPERT)
             record = entry
@@ -301,7 +302,7 @@ def train(
 
 
 def good_enough(config: ExpertConfig, record: dict[str, Any]) -> bool:
-    """Whether the best expert so far reaches the scores to stop at."""
+    """Whether an expert with this record, which may be empty, reaches the scores to stop at."""
     return bool(record) and record["success_at_end"] >= config.stop_success and record["return"] >= config.stop_return
 
 

@@ -28,6 +28,18 @@ def test_the_best_expert_is_kept_and_not_the_last(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "record.json").read_text()) == record
 
 
+def test_an_expert_that_reaches_both_scores_is_kept_though_another_had_a_higher_return(tmp_path, monkeypatch):
+    scores = iter([(3.0, 0.5), (2.5, 1.0), (9.0, 1.0)])
+    monkeypatch.setattr(expert, "EVALUATION_SEEDS", range(1))
+    monkeypatch.setattr(
+        expert, "summarise", lambda episodes: dict(zip(("return", "success_at_end"), next(scores), strict=True))
+    )
+    config = TINY_EXPERT.model_copy(update={"stop_return": 2.0, "stop_success": 0.9})
+    record = expert.train(PickCube(), config, tmp_path, 1, print)
+    assert (record["return"], record["steps"]) == (2.5, 200)
+    assert json.loads((tmp_path / "record.json").read_text()) == record
+
+
 def test_advantages_follow_their_definition():
     draws = torch.Generator().manual_seed(0)
     rewards, values = torch.rand((5, 2), generator=draws), torch.rand((6, 2), generator=draws)
