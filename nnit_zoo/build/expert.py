@@ -36,13 +36,27 @@ OPEN = (0.4, 1.0)  # range of the gripper's action then
 Network = list[tuple[Array, Array]]  # (weight [out, in], bias [out]) of each layer
 
 
-class ExpertConfig(BaseModel):
-    """PPO's settings; ManiSkill's baseline with fewer environments and a longer horizon (gamma 0.9 for its 0.8).
+class Release(BaseModel):
+    """How an expert is taught to let go of a cube.
 
     A gripper that holds a cube learns to close far beyond what counts, where no noise opens it, and one step open does
-    not let go: without help, StackCubeEasy-v1's expert holds its cube in place for ever. `bound_weight` weights the
-    square by which mean actions leave [-1, 1]; in a share `shown_release` of the training episodes the gripper lets go.
+    not let go: without help, the cube is held in place for ever. With it from the start, the place is shunned.
     """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    after_steps: int
+    """When this begins: once cubes are held in place."""
+    share: float
+    """Of the training episodes: in these the gripper opens, for good, once it holds the cube in place."""
+    bound_weight: float
+    """Of the square by which mean actions leave [-1, 1], in the loss."""
+    least_std: float
+    """Of the gripper's action."""
+
+
+class ExpertConfig(BaseModel):
+    """PPO's settings; ManiSkill's baseline with fewer environments and a longer horizon (gamma 0.9 for its 0.8)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -58,20 +72,24 @@ class ExpertConfig(BaseModel):
     minibatch: int = 400
     clip: float = 0.2
     value_weight: float = 0.5
-    bound_weight: float = 0.0
-    shown_release: float = 0.0
     target_kl: float = 0.1
     max_grad_norm: float = 0.5
     evaluate_every: int = 40
     stop_success: float = 0.99
     stop_return: float = 39.0
+    release: Release | None = None
 
 
 CONFIG_BY_TASK = {
     "PushCube-v1": ExpertConfig(stop_success=0.98, stop_return=42.0),
-    "StackCubeEasy-v1": ExpertConfig(stop_success=0.95, stop_return=38.0, bound_weight=0.3, shown_release=0.5),
+    "StackCubeEasy-v1": ExpertConfig(
+        stop_success=0.95,
+        stop_return=38.0,
+        total_steps=12_000_000,
+        release=Release(after_steps=1_800_000, share=0.5, bound_weight=0.3, least_std=0.6),
+    ),
 }
-"""For tasks whose expert stops at other scores than PickCube-v1's, or learns otherwise."""
+"""For tasks whose expert stops at other scores than PickCube-v1's, or learns otherwise, or for longer."""
 
 
 class ActorCritic(nn.Module):
@@ -138,14 +156,14 @@ def play(task: RobotPolicyTask, network: Network, seeds: range) -> Episodes:
 
 
 def explore(
-    task: RobotPolicyTask, network: Network, seeds: range, std: Array, noise_seed: int, shown_release: float
+    task: RobotPolicyTask, network: Network, seeds: range, std: Array, noise_seed: int, released: float
 ) -> Episodes:
     """Training episodes: Gaussian noise of this standard deviation [outputs] on the actions.
 
-    In a share `shown_release` of them the gripper opens, for good, once it holds the object where it belongs.
+    In a share `released` of them the gripper opens, for good, once it holds the object where it belongs.
     """
     noise, shown = np.random.default_rng(noise_seed), np.random.default_rng((noise_seed, 1))
-    chosen = shown.random(len(seeds)) < shown_release
+    chosen = shown.random(len(seeds)) < released
     opened = np.zeros(len(seeds), bool)
 
     def act(observations: Array) -> Array:
@@ -207,15 +225,24 @@ class Training:
         self.generator.set_state(state["generator"])
         self.iteration, self.best_return = state["iteration"], state["best_return"]
 
+    @property
+    def release(self) -> Release | None:
+        """How letting go is taught, once it is."""
+        release = self.config.release
+        return release if release and self.steps >= release.after_steps else None
+
     def iterate(self, workers: int) -> float:
         """Roll out one episode per environment, update, and return the mean undiscounted return."""
-        task, network = self.task, network_of(self.model.actor)
+        task, network, release = self.task, network_of(self.model.actor), self.release
+        if release:
+            with torch.no_grad():
+                self.model.log_std[-1].clamp_(min=math.log(release.least_std))
         std = self.model.log_std.detach().exp().numpy()
         first = TRAINING_SEEDS + self.iteration * self.config.environments
 
         def unit_episodes(unit: range) -> Episodes:
             noise_seed = first + (unit.start - first) // UNIT
-            return explore(task, network, unit, std, noise_seed, self.config.shown_release)
+            return explore(task, network, unit, std, noise_seed, release.share if release else 0.0)
 
         # Units of a fixed size, each with noise of its own: the number of workers changes no number.
         episodes = in_chunks(unit_episodes, range(first, first + self.config.environments), UNIT, workers)
@@ -227,7 +254,7 @@ class Training:
         return float(rewards.sum(0).mean())
 
     def _update(self, observations: Tensor, actions: Tensor, rewards: Tensor) -> None:
-        config = self.config
+        config, release = self.config, self.release
         rate = config.learning_rate * max(1 - self.steps / config.total_steps, 0.05)
         self.optimizer.param_groups[0]["lr"] = rate
         with torch.no_grad():
@@ -248,8 +275,10 @@ class Training:
                 clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
                 policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()
                 value_loss = 0.5 * (self.model.critic(states[rows])[:, 0] - targets[rows]).square().mean()
-                excess = (means.abs() - 1).clamp(min=0).square().sum(1).mean()
-                loss = policy_loss + config.value_weight * value_loss + config.bound_weight * excess
+                loss = policy_loss + config.value_weight * value_loss
+                if release:
+                    excess = (means.abs() - 1).clamp(min=0).square().sum(1).mean()
+                    loss = loss + release.bound_weight * excess
                 self.optimizer.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)

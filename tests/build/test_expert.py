@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nnit_zoo.build import expert
-from nnit_zoo.build.expert import ExpertConfig
+from nnit_zoo.build.expert import ExpertConfig, Release
 from nnit_zoo.tasks.pick_cube import PickCube
 from nnit_zoo.tasks.stack_cube_easy import StackCubeEasy
 
@@ -68,10 +68,29 @@ def test_letting_go_is_shown_from_when_the_cube_is_held_in_place(monkeypatch):
     assert abs(plain).max() < 0.6
 
 
+def test_letting_go_is_taught_from_when_it_is_told(monkeypatch):
+    """Until then, the training is that without it, to the bit."""
+    release = Release(after_steps=200, share=1.0, bound_weight=1.0, least_std=0.9)
+    shares = []
+    explore = expert.explore
+    monkeypatch.setattr(expert, "explore", lambda *given: shares.append(given[-1]) or explore(*given))
+    taught, plain = (
+        expert.Training(PickCube(), TINY_EXPERT.model_copy(update={"release": each})) for each in (release, None)
+    )
+    for _ in range(2):
+        assert taught.iterate(1) == plain.iterate(1)
+    assert all(torch.equal(*pair) for pair in zip(taught.model.parameters(), plain.model.parameters(), strict=True))
+    taught.iterate(1)
+    assert shares == [0.0] * 4 + [1.0]
+    taught_std, plain_std = (training.model.log_std[-1].exp().item() for training in (taught, plain))
+    assert taught_std == pytest.approx(0.9, abs=0.01) and plain_std < 0.7
+
+
 @pytest.mark.parametrize(("weight", "low", "high"), [(0.0, 2.9, 3.1), (1.0, 0.5, 1.1)])
 def test_mean_actions_are_held_within_what_the_robot_takes(weight, low, high):
     """A gripper whose mean is far outside is out of reach of its noise, and could never learn to open."""
-    config = TINY_EXPERT.model_copy(update={"bound_weight": weight, "learning_rate": 1e-3, "total_steps": 10**6})
+    release = Release(after_steps=0, share=0.0, bound_weight=weight, least_std=0.1)
+    config = TINY_EXPERT.model_copy(update={"release": release, "learning_rate": 1e-3, "total_steps": 10**6})
     training = expert.Training(PickCube(), config)
     with torch.no_grad():
         training.model.actor[-1].bias.fill_(3.0)
