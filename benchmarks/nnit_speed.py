@@ -40,6 +40,7 @@ class Stopwatch:
     def __init__(self, settings: NNiTConfig, view: TrainingView) -> None:
         self.generator = NNiT(settings)
         self.generator.fit(view, FitOptions(steps=1))
+        self.generator.settings = settings  # the learning rate's schedule is that of the whole training
         data = [Packed.of(view.batch(each), self.generator.form, settings) for each in view.architectures]
         self.trainer = Trainer(self.generator.model, data, self.generator.mixture, seed=0)
         self.trainer.advance()  # the first step allocates

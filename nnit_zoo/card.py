@@ -23,6 +23,7 @@ from nnit_zoo.atomic import write_atomically, write_bytes, write_json
 from nnit_zoo.errors import UserError
 from nnit_zoo.places import data_folder
 from nnit_zoo.summary import by_split
+from nnit_zoo.tasks.mnist import FEATURES
 from nnit_zoo.zoo import Zoo, damaged
 
 DESCRIPTION = (
@@ -84,6 +85,8 @@ network = torch.nn.Sequential(*modules[:-1])
 
 `parameters` are float16: layer by layer, row by row, a row per output neuron with its bias at the end. A network takes
 standardised observations, `(observation - mean) / std` with `observation_mean` and `observation_std` of `task.json`.
+An observation of MNIST-PCA32 is a digit's `(pixels / 255 - mean) @ components.T`; `MNIST-PCA32/features.safetensors`
+has this basis, and all digits' observations and labels.
 
 With the `nnit` package: `nnit-zoo download --task {task} --source {repository}`, then `nnit_zoo.load("{task}")`.
 
@@ -105,7 +108,8 @@ With the `nnit` package: `nnit-zoo download --task {task} --source {repository}`
 
 ## Licence
 
-CC BY 4.0. The method is of NNiT ([arXiv 2603.00180](https://arxiv.org/abs/2603.00180)); these networks were built anew.
+CC BY 4.0; MNIST-PCA32's features CC BY-SA 3.0, as MNIST itself. The method is of NNiT
+([arXiv 2603.00180](https://arxiv.org/abs/2603.00180)); these networks were built anew.
 """
 
 
@@ -159,6 +163,8 @@ def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> 
         record, data = tasks.get(zoo.task).record, data_folder(zoo.task)
         ships = (data / files.MANIFEST).is_file() and files.Manifest.read(data) == zoo.manifest
         write_json(place / "task.json", {name: value for name, value in record.items() if name != "build" or ships})
+        if (data / FEATURES).is_file():  # what MNIST-PCA32's policies see of a digit
+            write_atomically(place / FEATURES, partial(shutil.copyfile, data / FEATURES))
         if ships:
             for name in (files.EXPERT, files.GHNS, files.SELECTION, files.CANDIDATE_EPISODES):
                 if (data / name).is_file():  # MNIST-PCA32 has no expert

@@ -92,10 +92,11 @@ class _Lines:
     def advance(self, done: int) -> None:
         self._done += done
         now = time.monotonic()
+        if now - self._start < 1:
+            self._done_before = self._done  # what an earlier run had finished is no sign of how fast this one is
         if self._done >= self._total:
             self._display.note(f"{self._label}: {self._total} of {self._total} in {_duration(now - self._start)}")
         elif now - self._last >= SECONDS_BETWEEN_LINES and self._done > self._done_before:
-            # Not since the start: what an earlier run had finished is done at once.
             rate = (self._done - self._done_before) / (now - self._last)
             left = _duration((self._total - self._done) / rate)
             self._display.note(f"{self._label}: {self._done} of {self._total}, {_rate(rate)}, {left} left")

@@ -39,8 +39,8 @@ class Difference:
 
     @property
     def separable(self) -> bool:
-        """Whether the interval of the difference leaves out zero."""
-        return self.difference.low > 0 or self.difference.high < 0
+        """Whether the difference has an interval, and it leaves out zero."""
+        return _leaves_out_zero(self.difference)
 
 
 def compare(
@@ -99,10 +99,13 @@ def tied(first: StoredRun, second: StoredRun) -> bool:
     """Whether two runs can be compared, and not be told apart in their mean headline score."""
     protocol = first.record.protocol
     try:
-        change = _difference(*_everything(first, second), protocol.metrics[0], protocol, drawn=True)
+        return not _leaves_out_zero(_difference(*_everything(first, second), protocol.metrics[0], protocol, drawn=True))
     except Incomparable:
         return False
-    return change.low <= 0 <= change.high
+
+
+def _leaves_out_zero(change: Estimate) -> bool:
+    return change.low < change.high and not change.low <= 0 <= change.high
 
 
 def _everything(first: StoredRun, second: StoredRun) -> tuple[Scores, Scores]:
@@ -167,7 +170,7 @@ def _print(runs: Sequence[StoredRun], differences: Sequence[Difference]) -> None
     for each in differences:
         metric = metrics[each.metric]
         both = (f"{value * metric.scale:.1f}" for value in (each.first, each.second))
-        name = NAMES[each.statistic] if each.statistic != "top" else f"top-{protocol.top}"
+        name = NAMES[each.statistic] if each.statistic != "top" else f"top-{protocol.best}"
         change = "\n".join(each.difference.text(metric.scale, signed=True))
         table.add_row(metric.heading, name, *both, change, "yes" if each.separable else "no")
     console.print(
@@ -183,6 +186,11 @@ def in_words(first: str, second: str, difference: Difference, metric: Metric) ->
     value, interval = difference.difference.text(metric.scale, signed=True)
     if not interval and difference.first == difference.second:
         return f"{first} and {second} do the same in every episode: nothing tells them apart in mean {metric.label}."
+    if not interval:
+        return (
+            f"{first} and {second} cannot be told apart in mean {metric.label}: "
+            f"{value}{unit} over too few architectures or episodes for an interval."
+        )
     if not difference.separable:
         return (
             f"{first} and {second} cannot be told apart in mean {metric.label}: "

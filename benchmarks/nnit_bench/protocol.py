@@ -97,6 +97,16 @@ class Protocol(_Frozen):
     """The episodes that the selected play again; null under `paper`, and for a task whose episodes are a test set. Such
     a set is halved instead: selected on its even seeds, scored on the odd ones."""
 
+    @property
+    def size(self) -> int:
+        """How many policies are generated in all."""
+        return sum(self.policies.values())
+
+    @property
+    def best(self) -> int:
+        """How many are selected: `top`, if there are as many."""
+        return min(self.top, self.size)
+
     @model_validator(mode="after")
     def _sizes(self) -> Protocol:
         if not self.policies or min(self.policies.values()) < 0 or max(self.policies.values()) < 1:

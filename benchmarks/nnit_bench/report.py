@@ -159,7 +159,7 @@ def _row(run: StoredRun, group: Group, metric: Metric, ties: Sequence[str]) -> s
 
 def _size(run: StoredRun, group: Group) -> str:
     """How large a run is, if it is smaller than others of its group."""
-    sizes = [(sum(each.policies.values()), each.select.count) for each in (one.record.protocol for one in group)]
+    sizes = [(each.size, each.select.count) for each in (one.record.protocol for one in group)]
     mine = sizes[group.index(run)]
     return "" if mine == max(sizes) else f" ({mine[0]} policies, {mine[1]} episodes each)"
 

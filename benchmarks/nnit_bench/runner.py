@@ -257,7 +257,7 @@ def sample(task: Task, entry: Entry, protocol: Protocol, stage: Stage) -> list[P
     name, generator = entry.method.name, entry.generator
     assert generator is not None
     batches = []
-    with stage(f"{name}: sampling policies", sum(protocol.policies.values())) as advance:
+    with stage(f"{name}: sampling policies", protocol.size) as advance:
         for text, count in protocol.policies.items():
             seed = sample_seed(protocol.seed, text)
             if protocol.is_joint:

@@ -11,6 +11,8 @@ Miller 2011). The interval is a bootstrap-t (Efron and Tibshirani 1993, 12.5): w
 with replacement, and what is resampled is the mean's distance from the truth in standard errors. Unlike percentiles it
 is wide enough for few units: 8 architectures are few.
 
+Fewer than five drawn units say too little of how units differ: there is no interval then.
+
 Units may also be *given* instead of drawn, such as ten policies that were picked: then only episodes vary.
 
 If every episode went the same way there is nothing to resample; the open end of the interval is then Clopper and
@@ -28,6 +30,7 @@ from numpy.typing import NDArray
 REPLICATES = 2000
 ROUNDING = 1e-20  # a variance up to this is zero: scores are of the order of 1 to 50
 TAILS = (0.025, 0.975)
+FEWEST_UNITS = 5  # with 2 units the interval held the truth in 74 to 88 % of simulations, with 5 in 92 to 95 %
 LEAST_VARIANCE = 0.1  # of a resampled table, as a share of the table's own: a few units all alike must not divide by 0
 
 Floats = NDArray[np.float64]
@@ -36,7 +39,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and its 95 % interval."""
+    """A mean and its 95 % interval, which has no width if there is none to be had."""
 
     value: float
     low: float
@@ -90,10 +93,12 @@ def estimate(
     methods that share no units is that of the one and minus the other. Units that are not `drawn` are taken as given.
     `bounds` are the least and the largest value that the sum can have.
     """
+    value = float(sum(table.mean() for table in tables))
+    if drawn and min(map(len, tables)) < FEWEST_UNITS:
+        return Estimate(value, value, value)
     if not drawn:
         tables = [table.mean(0, keepdims=True) for table in tables]
     episodes = tables[0].shape[1]
-    value = float(sum(table.mean() for table in tables))
     centred = [table - table.mean() for table in tables]
     variance = float(_moments(centred, [_once(len(table)) for table in tables], _once(episodes))[1][0])
     if variance > ROUNDING:

@@ -66,22 +66,27 @@ def plain(results: Results) -> dict[str, Any]:
 
 
 def _title(protocol: Protocol) -> str:
-    policies, episodes = sum(protocol.policies.values()), protocol.select.count
-    chosen = "its own" if protocol.is_joint else str(len(protocol.policies))
+    policies, episodes = _count(protocol.size, "policies", "policy"), protocol.select.count
+    listed = _count(len(protocol.policies), "architectures", "architecture")
+    chosen = "its own architectures" if protocol.is_joint else listed
     simulator = f", on {protocol.simulator}" if protocol.simulator not in (None, "fast") else ""
     return (
-        f"{protocol.task}, {protocol.split}: {policies} policies, {chosen} architectures, "
-        f"{episodes} episodes per policy{simulator}"
+        f"{protocol.task}, {protocol.split}: {policies}, {chosen}, "
+        f"{_count(episodes, 'episodes', 'episode')} per policy{simulator}"
     )
+
+
+def _count(number: int, several: str, one: str) -> str:
+    return f"{number} {one if number == 1 else several}"
 
 
 def _selection(protocol: Protocol) -> str:
     """What the columns of the best policies mean."""
-    same = f"top-{protocol.top}: selected and scored on the same episodes"
+    same = f"top-{protocol.best}: selected and scored on the same episodes"
     if protocol.selection == "paper":
         return f"{same}."
     if protocol.report:
-        return f"{same}; held out: the same {protocol.top} policies on others."
+        return f"{same}; held out: the same {_count(protocol.best, 'policies', 'policy')} on others."
     return f"{same}; held out: selected on half of them, scored on the other half."
 
 
@@ -90,7 +95,7 @@ def _scores(results: Results) -> Table:
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     table.add_column("", overflow="fold")
     table.add_column("score", no_wrap=True)
-    for heading in ("mean", f"top-{protocol.top}", "held out", "worst arch."):
+    for heading in ("mean", f"top-{protocol.best}", "held out", "worst arch."):
         table.add_column(heading, justify="right")
     for outcome in results.outcomes:
         record = outcome.record
@@ -137,7 +142,7 @@ def _remarks(console: Console, outcome: Outcome) -> None:
         console.print(
             f"{name}: {joint.distinct} different architectures, among them {joint.unseen} of the 8 unseen, "
             f"{joint.excluded} of the 9 excluded and {joint.outside} others beyond the zoo's; {joint.distinct_in_top} "
-            f"in the top-{record.protocol.top}; {joint.functional:.0%} of the policies score 50 % or more"
+            f"in the top-{record.protocol.best}; {joint.functional:.0%} of the policies score 50 % or more"
         )
 
 

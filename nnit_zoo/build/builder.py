@@ -32,6 +32,9 @@ from nnit_zoo.policy import PolicyBatch, concatenate
 from nnit_zoo.provenance import commit
 from nnit_zoo.tasks.task import Task
 
+ZOO = (GHNS, CANDIDATE_EPISODES, SELECTION, INDEX, MANIFEST)
+"""The files of a zoo that `pack` puts in place, in this order."""
+
 
 def log(message: str) -> None:
     """Tell the user how a stage goes, on stderr."""
@@ -136,7 +139,7 @@ class Builder(ABC):
         pq.write_table(pa.concat_tables(tables), whole / CANDIDATE_EPISODES, compression="zstd")
         pq.write_table(pa.Table.from_pylist(rows, SELECTION_SCHEMA), whole / SELECTION, compression="zstd")
         write_manifest(whole, self.task.standardisation)
-        for name in (GHNS, CANDIDATE_EPISODES, SELECTION, INDEX, MANIFEST):
+        for name in ZOO:
             write_atomically(self.data / name, partial(shutil.copyfile, whole / name))
         shutil.rmtree(whole)
         seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]

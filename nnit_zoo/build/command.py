@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 
 from nnit_zoo import tasks
-from nnit_zoo.build.builder import Builder
+from nnit_zoo.build.builder import ZOO, Builder
 from nnit_zoo.build.mnist import MNISTBuilder
 from nnit_zoo.build.robot import RobotBuilder
 from nnit_zoo.errors import UserError
@@ -56,11 +56,11 @@ def build(
     shipped = data_folder(task) / SELECTION
     packed, made = ghns_of(shipped) if shipped.exists() else 0, len(list((work / task / "ghns").glob("*.safetensors")))
     seeds = seeds or max(packed, made) or 16
-    for there, what, place in ((packed, "zoo", shipped.parent), (made, "scores", work / task)):
+    for there, place, parts in ((packed, shipped.parent, ZOO), (made, work / task, ("ghns", "scores"))):
         if seeds < there:
             raise UserError(
-                f"{place} has {there} GHNs of {task}, and the {what} of {seeds} would take the place of theirs; "
-                "move it elsewhere first if that is meant"
+                f"{place} is of {there} GHNs, and {seeds} would take their place; "
+                f"if that is meant, first move elsewhere, from there, {', '.join(parts)}"
             )
     builder: Builder
     if isinstance(chosen, RobotPolicyTask) and source is None:

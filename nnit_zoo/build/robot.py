@@ -70,6 +70,7 @@ class RobotBuilder(Builder):
         probe = torch.from_numpy(states[np.arange(PROBE_STATES) * len(states) // PROBE_STATES]).half()
         write_bytes(self.data / PROBE, save({"states": probe}))
         experts.save(network, self.data / EXPERT)
+        (self.data / stats.TWINS).unlink(missing_ok=True)  # they were another expert's students
         log(f"expert: {json.dumps(record)}")
         if not experts.good_enough(self.expert_config, record):
             log("expert: it is below the scores to stop at; its students can only be worse")
@@ -85,6 +86,7 @@ class RobotBuilder(Builder):
 
     def training(self) -> tuple[Callable[[Path, int], str], dict[str, Any]]:
         """Regression onto the expert, on the buffer and on states of the GHN's own."""
+        self._require_states()
         train = partial(distill.train_ghn, self.task, self.distill_config, self._expert(), self._states)
         return train, {**self.distill_config.model_dump(), "states": self._count_states()}
 
@@ -95,8 +97,7 @@ class RobotBuilder(Builder):
 
     def twins(self) -> None:
         """Train and measure NNiT's twin populations; the networks, too large to ship, stay in the work folder."""
-        if not self._states.exists():
-            raise UserError(f"{self.task.name} has no states to learn from; run the stage 'states' first")
+        self._require_states()
         config, folder = self.twins_config, self.work / "twins"
         seeds = range(config.networks)
         paths = {kind: [folder / kind / f"{seed:03d}.safetensors" for seed in seeds] for kind in twins.KINDS}
@@ -131,6 +132,10 @@ class RobotBuilder(Builder):
     @property
     def _states(self) -> Path:
         return self.work / "states" / "states.safetensors"
+
+    def _require_states(self) -> None:
+        if not self._states.exists():
+            raise UserError(f"{self.task.name} has no states to learn from; run the stage 'states' first")
 
     def _expert(self) -> experts.Network:
         path = self.data / EXPERT

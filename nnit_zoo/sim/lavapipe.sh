@@ -13,6 +13,7 @@ for command in apt-get dpkg-deb; do
   command -v $command > /dev/null || fail "no $command: this is for Debian; elsewhere install Mesa 24.3 or newer"
 done
 . /etc/os-release
+[ "$ID" = debian ] || fail "this is for Debian, not for ${PRETTY_NAME:-$ID}; elsewhere install Mesa 24.3 or newer"
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 cd "$work"

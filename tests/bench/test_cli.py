@@ -91,7 +91,7 @@ def test_several_splits_and_what_a_method_cannot(call: Call, fresh: Path, capsys
     arguments = ["--task", "Formula-v1", "--episodes", "2", "--policies", "1", "--output", fresh, "--quiet"]
     assert call("run", "--method", "ghn-oracle", "--split", "unseen,joint", *arguments) == 0
     out, err = capsys.readouterr()
-    assert "Formula-v1, unseen: 8 policies" in out and "Formula-v1, joint: 1 policies, its own" in out
+    assert "Formula-v1, unseen: 8 policies" in out and "Formula-v1, joint: 1 policy, its own" in out
     assert "ghn-oracle: does not choose architectures" in out and "unsupported" in out
     assert err == ""
 

@@ -76,6 +76,15 @@ def test_only_shared_architectures_and_episodes_count(store: Store, protocol: Pr
         compare.differ(whole, store("apart", apart, everything))
 
 
+def test_too_few_architectures_tell_no_methods_apart(store: Store, protocol: Protocol) -> None:
+    few = protocol.model_copy(update={"policies": dict(list(protocol.policies.items())[:4])})
+    runs = [store(name, few, outcomes(level, 1)[:40]) for name, level in (("better", 1.5), ("worse", 0.0))]
+    mean = compare.differ(*runs)[0]
+    assert not mean.separable and compare.tied(*runs)
+    words = compare.in_words("better", "worse", mean, few.metrics[0])
+    assert "cannot be told apart" in words and "over too few architectures" in words
+
+
 def test_policies_of_a_generator_that_chooses_are_not_paired(store: Store, protocol: Protocol) -> None:
     joint = protocol.model_copy(update={"split": "joint", "policies": {"any": 80}})
     better = store("better", joint, outcomes(1.5, 1))

@@ -116,6 +116,11 @@ def test_nothing_but_success_leaves_room_for_failure(value: float) -> None:
     assert (ours.low, ours.high) == pytest.approx((exact.low, exact.high))
 
 
-def test_one_policy_and_one_episode_have_no_interval() -> None:
-    ours = mean(np.array([[3.0]]), None, np.random.default_rng(0))
-    assert (ours.low, ours.high) == (3, 3)
+@pytest.mark.parametrize(
+    ("units", "drawn", "has"), [(1, True, False), (4, True, False), (5, True, True), (1, False, True)]
+)
+def test_few_drawn_units_have_no_interval(units: int, drawn: bool, has: bool) -> None:
+    """A policy or two say little of how policies differ; of given ones only the episodes matter."""
+    values = np.random.default_rng(0).random((units, 50))
+    ours = mean(values, None, np.random.default_rng(0), drawn=drawn)
+    assert ours.value == pytest.approx(values.mean()) and (ours.low < ours.value < ours.high) is has

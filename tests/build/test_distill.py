@@ -43,6 +43,26 @@ def test_teacher_and_students_act_as_often_as_they_should():
     assert not np.array_equal(teachers.observations, theirs.observations)
 
 
+def test_teacher_and_students_share_the_steps_and_the_teachers_actions_are_noisy(monkeypatch):
+    """The student opens the gripper wide, the teacher closes it: who has acted shows in the action."""
+    seeds, acted = range(8), []
+
+    def play(task, seeds, act):
+        acted.extend(act(np.zeros((len(seeds), task.inputs), np.float32)) for _ in range(400))
+        return rollout(Short(), range(1), lambda observations: np.zeros((1, 8), np.float32))
+
+    monkeypatch.setattr(distill, "rollout", play)
+    monkeypatch.setattr(distill, "Controller", lambda *_: lambda observations: np.full((len(seeds), 8), 3, np.float32))
+    closing = [(np.zeros((8, 42), np.float32), np.full(8, -1, np.float32))]
+    distill.collect(PickCube(), closing, {seed: [] for seed in seeds}, 0.3, 0.4, seeds)
+    actions = np.array(acted)  # [steps, episodes, 8]
+    teachers = (actions != 3).all(-1)
+    assert teachers.mean() == pytest.approx(0.3, abs=0.03)
+    scales = [actions[:, episode][teachers[:, episode]].std() for episode in range(8)]
+    assert 0 < min(scales) < max(scales) <= 0.42 and max(scales) > 3 * min(scales)
+    assert actions[teachers].mean() == pytest.approx(-1, abs=0.05)
+
+
 def test_the_expert_labels_raw_observations_and_students_see_standardised_ones():
     task, network = PickCube(), toy_network()
     raw = np.random.default_rng(0).normal(size=(5, 42)).astype(np.float32)
@@ -63,6 +83,25 @@ def test_no_ghn_and_no_round_plays_the_episodes_of_another(tmp_path, monkeypatch
     for seed in (0, 1):
         distill.train_ghn(PickCube(), TINY_DISTILL, toy_network(), tmp_path / "states", tmp_path / str(seed), seed)
     assert len(played) == len(set(played)) == 2 * TINY_DISTILL.own_rounds * TINY_DISTILL.own_episodes
+
+
+def test_a_ghns_own_states_get_their_share_of_every_batch():
+    config = TINY_DISTILL.model_copy(update={"states_per_architecture": 100, "own_share": 0.25})
+    taken = []
+
+    def note(outputs, labels):
+        taken.append(labels[:, 0])
+        return outputs.square().mean()
+
+    ghn = GHN(42, 8, 0)
+    fit, optimizer = Fit(ghn, config, seed=0, loss=note), torch.optim.SGD(ghn.parameters(), lr=0.0)
+    numbers = torch.arange(50.0)[:, None].expand(50, 8)
+    fit.run(torch.zeros(50, 42), numbers, 3, optimizer, own=10)
+    assert [int((rows >= 40).sum()) for rows in taken] == [25] * 3 * config.architectures_per_step
+    taken.clear()
+    fit.run(torch.zeros(40, 42), numbers[:40], 1, optimizer)
+    assert len(taken[0]) == 100 and taken[0].max() < 40
+    assert {int(row) for rows in taken for row in rows} > set(range(30))
 
 
 def test_weight_noise_is_relative_to_each_block():

@@ -176,7 +176,7 @@ def test_a_build_that_goes_on_keeps_to_the_ghns_that_are_there(builder, tmp_path
     command.build(stage="scores", **options)
     scores = tmp_path / "MNIST-PCA32" / "scores" / "16-16-16-32.parquet"
     assert set(pq.read_table(scores)["ghn_seed"].to_pylist()) == {0, 1, 2}
-    with pytest.raises(UserError, match="has 3 GHNs of MNIST-PCA32, and the scores of 2 would take the place of"):
+    with pytest.raises(UserError, match=r"is of 3 GHNs, and 2 would take their place; .* ghns, scores"):
         command.build(stage="scores", seeds=2, **options)
 
 
@@ -225,6 +225,10 @@ def kill_second_call(monkeypatch, module, name):
 def test_a_stage_without_the_one_before_says_which_to_run(builder, tmp_path):
     with pytest.raises(UserError, match="stage 'expert' first"):
         builder(tmp_path).states()
+    built = builder(tmp_path)
+    built.expert()
+    with pytest.raises(UserError, match="stage 'states' first"):
+        built.ghns()
     with pytest.raises(UserError, match="stage 'ghns' first"):
         builder(tmp_path).pack()
 
@@ -355,7 +359,7 @@ def test_a_zoo_is_in_place_until_another_is_whole_and_not_replaced_by_a_smaller_
     with pytest.raises(UserError, match="was made for other features"):
         builder(tmp_path, "MNIST-PCA32", source=str(sample)).features()
     monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
-    with pytest.raises(UserError, match="has 2 GHNs of MNIST-PCA32, and the zoo of 1 would take the place of theirs"):
+    with pytest.raises(UserError, match=r"is of 2 GHNs, and 1 would take their place; .* ghns\.safetensors, scores"):
         command.build(task="MNIST-PCA32", seeds=1, work=tmp_path)
 
 

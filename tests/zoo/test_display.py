@@ -25,7 +25,7 @@ def test_a_log_gets_rate_and_time_left(clock, capsys):
         advance(clock, stage, (0, 200), (20, 300), (1, 0), (20, 210), (0, 1290))
     assert capsys.readouterr().err.splitlines() == [
         "episodes: 2000",
-        "episodes: 500 of 2000, 25/s, 60 s left",
+        "episodes: 500 of 2000, 15/s, 100 s left",
         "episodes: 710 of 2000, 10/s, 129 s left",
         "episodes: 2000 of 2000 in 41 s",
     ]

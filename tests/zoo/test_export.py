@@ -136,6 +136,8 @@ def test_datasets_reads_the_folder_and_the_cards_example_works(dataset: Path, ma
     observations = torch.randn(5, 42, generator=torch.Generator().manual_seed(0))
     module = zoo[names["policy"]["id"]].to_module(standardised=True)
     assert torch.equal(names["network"](observations), module(observations))
+    features = load_file(dataset / "MNIST-PCA32" / "features.safetensors")
+    assert features["mean"].shape == (784,) and features["components"].shape == (32, 784)
     constants = json.loads((dataset / "PickCube-v1" / "task.json").read_text())
     assert np.array_equal(np.float32(constants["observation_std"]), tasks.get("PickCube-v1").observation_std)
 
