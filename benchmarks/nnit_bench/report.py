@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from nnit_bench import paper, results, scores
 from nnit_bench.compare import tied
-from nnit_bench.protocol import SPLITS, policies_per_architecture
+from nnit_bench.protocol import SPLITS, architectures
 from nnit_bench.results import FOLDERS, Folders, StoredRun
 from nnit_bench.statistics import Estimate
 from nnit_zoo.atomic import write_atomically, write_bytes
@@ -195,7 +195,7 @@ def _by_architecture(runs: Sequence[StoredRun]) -> Figure:
 
     metric = _headline(runs[0])
     asked = {name for run in runs for name in run.record.protocol.policies}
-    names = [name for name in policies_per_architecture(runs[0].record.protocol.split) if name in asked]
+    names = [name for name in architectures(runs[0].record.protocol.split) if name in asked]
     many = len(names) > LEVEL_NAMES
     figure = Figure(figsize=(12 if many else 8, 4), layout="constrained")
     axes = figure.subplots()
