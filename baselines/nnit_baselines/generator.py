@@ -194,11 +194,12 @@ class Generator(ABC):
 
         Raises UserError if the Hub refuses.
         """
-        with tempfile.TemporaryDirectory() as folder, explained(repo_id):
+        with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder)
-            hub = HfApi()
-            hub.create_repo(repo_id, exist_ok=True)
-            return str(hub.upload_folder(repo_id=repo_id, folder_path=folder))
+            with explained(repo_id):
+                hub = HfApi()
+                hub.create_repo(repo_id, exist_ok=True)
+                return str(hub.upload_folder(repo_id=repo_id, folder_path=folder))
 
 
 def refuse_reference(view: TrainingView) -> None:

@@ -151,19 +151,19 @@ def save(network: Network, path: Path) -> None:
 
 
 def play(task: RobotPolicyTask, network: Network, seeds: range) -> Episodes:
-    """Episodes of the expert."""
+    """Episodes of the expert, one for each seed, in lockstep."""
     return rollout(task, seeds, partial(mean_action, network))
 
 
 def explore(
-    task: RobotPolicyTask, network: Network, seeds: range, std: Array, noise_seed: int, released: float
+    task: RobotPolicyTask, network: Network, seeds: range, std: Array, noise_seed: int, release_share: float
 ) -> Episodes:
     """Training episodes: Gaussian noise of this standard deviation [outputs] on the actions.
 
-    In a share `released` of them the gripper opens, for good, once it holds the object where it belongs.
+    In a share `release_share` of them the gripper opens, for good, once it holds the object where it belongs.
     """
     noise, shown = np.random.default_rng(noise_seed), np.random.default_rng((noise_seed, 1))
-    chosen = shown.random(len(seeds)) < released
+    chosen = shown.random(len(seeds)) < release_share
     opened = np.zeros(len(seeds), bool)
 
     def act(observations: Array) -> Array:

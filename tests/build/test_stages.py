@@ -338,7 +338,9 @@ def test_nothing_is_built_on_another_expert(builder, tmp_path):
     with pytest.raises(UserError, match="expert was made with other settings"):
         other.expert()
     shutil.rmtree(tmp_path / "work" / "expert")
+    (data_folder("PickCube-v1") / stats.TWINS).touch()
     other.expert()
+    assert not (data_folder("PickCube-v1") / stats.TWINS).exists()  # they were the old one's students
     with pytest.raises(UserError, match="states was made with other settings"):
         builder(tmp_path).states()
 
