@@ -247,21 +247,23 @@ def render(
 
 @app.command(name="list")
 def list_names(*, as_json: Json = False) -> None:
-    """List the methods and tasks, and which checkpoints ship with nnit."""
+    """List the methods and tasks, and which checkpoints and zoos ship with nnit."""
     from nnit_baselines import registry
-    from nnit_zoo import tasks
+    from nnit_zoo import places, tasks
 
     found = registry.available()
     methods = {name: [task for task in tasks.names() if registry.checkpoint(name, task)] for name in found}
+    zoos = places.tasks_with_zoo()
     if as_json:
-        print_json({"methods": methods, "tasks": tasks.names()})
+        print_json({"methods": methods, "tasks": tasks.names(), "zoos": zoos})
         return
     for name, shipped in methods.items():
         checkpoints = f"checkpoint for {', '.join(shipped)}" if shipped else "no checkpoint"
         needed = found[name].capabilities.checkpoint
         sys.stdout.write(f"method  {name:12}  {checkpoints if needed else 'needs no training'}\n")
     for name in tasks.names():
-        sys.stdout.write(f"task    {name}\n")
+        zoo = "its zoo ships" if name in zoos else f"no zoo yet; nnit-zoo build --task {name} makes one"
+        sys.stdout.write(f"task    {name:16}  {zoo}\n")
 
 
 def main() -> None:

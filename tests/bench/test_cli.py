@@ -17,6 +17,7 @@ from nnit_bench.provenance import this_code
 from nnit_zoo import places, tasks
 from nnit_zoo.architecture import hidden_widths
 from nnit_zoo.errors import UserError
+from nnit_zoo.files import MANIFEST
 
 Call = Callable[..., int]
 pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
@@ -306,11 +307,21 @@ def test_completion_is_installed_and_completes(
     assert set(answer.stdout.split()) == offered
 
 
-def test_list_names_methods_and_tasks(call: Call, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_names_methods_and_tasks(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "PickCube-v1").mkdir()
+    (tmp_path / "PickCube-v1" / MANIFEST).touch()
+    monkeypatch.setattr(places, "DATA", tmp_path)
     assert call("list", "--json") == 0
     listed = json.loads(capsys.readouterr().out)
     assert {"nnit", "crop", "ghn-oracle"} <= set(listed["methods"])
-    assert "PickCube-v1" in listed["tasks"]
+    assert {"PickCube-v1", "StackCubeEasy-v1"} <= set(listed["tasks"])
+    assert listed["zoos"] == ["PickCube-v1"]
+    assert call("list") == 0
+    of_task = [line.split(maxsplit=2)[2] for line in capsys.readouterr().out.splitlines() if line.startswith("task")]
+    assert of_task[0] == "its zoo ships"
+    assert of_task[1] == "no zoo yet; nnit-zoo build --task PushCube-v1 makes one"
 
 
 def test_a_training_follows_its_options_and_is_tracked_live(
