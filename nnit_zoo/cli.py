@@ -216,7 +216,7 @@ def stats(
     if output is not None:
         analyses.require_matplotlib()
     zoo = load(task, folder)
-    chosen = [zoo.parse(text) for text in architecture or analyses.ARCHITECTURES]
+    chosen = [zoo.parse(text) for text in architecture] or analyses.examples(zoo)
     with Display(quiet=False).stage(f"analysing {task}", len(chosen) + len(zoo.architectures("seen"))) as tell:
         measures = analyses.analyse(zoo, chosen, tell)
     if output is not None:
@@ -239,7 +239,7 @@ def stats(
 def export(policy: str, output: Path, *, folder: Path | None = None, as_json: Json = False) -> None:
     """Write policies for other software: a policy, an architecture, or the whole zoo of a task.
 
-    A policy (TASK/32-16-64-32/005) becomes a module that takes raw observations: .safetensors (state of an
+    A policy (TASK/32-16-64-32/002) becomes a module that takes raw observations: .safetensors (state of an
     nn.Sequential), .pt2 (torch.export) or .onnx. Of an architecture (TASK/32-16-64-32), .safetensors holds all policies
     as stored. A zoo (TASK) becomes a folder that datasets.load_dataset reads.
 

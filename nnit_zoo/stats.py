@@ -59,6 +59,14 @@ PAPER_TWINS = {  # NNiT's tables 1 and of CKA, and its permutation ablation: of 
 }
 
 
+def examples(zoo: Zoo) -> list[Architecture]:
+    """The architectures to look at if none are named; raises UserError if none has two policies."""
+    able = [each for each in zoo.architectures("seen") if len(zoo.ghn_seeds(each, "seen")) > 1]
+    if not able:
+        raise UserError(f"no seen architecture in the zoo of {zoo.task} has two policies to compare")
+    return [each for each in able if str(each) in ARCHITECTURES] or able[:3]
+
+
 def analyse(zoo: Zoo, chosen: Sequence[Architecture], progress: Progress | None = None) -> list[dict[str, Any]]:
     """Rows of a table: `measure`, its value for each chosen architecture and on average over `all seen`, and `paper`.
 

@@ -51,7 +51,7 @@ class Policy:
 class Zoo:
     """The policies of one task in a folder; open one with `Zoo.open` or `nnit_zoo.load`.
 
-    Iterating gives every `Policy` in index order, and `zoo["PickCube-v1/32-16-64-32/005"]` the one with that id.
+    Iterating gives every `Policy` in index order, and `zoo["PickCube-v1/32-16-64-32/002"]` the one with that id.
     `index` has a row per policy: id, task, architecture, ghn_seed, split, success_once, success_at_end, return,
     episodes, shard, row, sha256, n_params, weight_norm. `split` is `seen`, `unseen`, `excluded`, or `heldout_seed` for
     GHN seeds from 128 on.

@@ -1,5 +1,6 @@
 """What ships fits together: each zoo's GHNs, its manifest, the checkpoints trained on it, and the official results."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,9 @@ from nnit_zoo.materialise import materialise
 from nnit_zoo.places import data_folder, tasks_with_zoo
 from nnit_zoo.zoo import Zoo, policy_hashes
 
+ROOT = Path(__file__).parents[1]
+TEXTS = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "nnit_zoo").glob("*.py")]
+POLICY = re.compile(r"\b([\w-]+)/\d+(?:-\d+)+/\d{3}\b")
 CHECKPOINTS = [path.parent for path in sorted(registry.CHECKPOINTS.glob(f"*/*/{WEIGHTS}"))]
 RESULTS = sorted(path.parent for path in SHIPPED.rglob(RECORD))
 
@@ -35,6 +39,14 @@ def test_a_zoo_follows_from_its_ghns(task: str, tmp_path: Path, monkeypatch: pyt
     zoo, architecture = Zoo.open(tmp_path), Path(smallest).stem
     listed = files.read_index(data_folder(task) / files.INDEX, architecture)
     assert policy_hashes(zoo.batch(architecture)) == listed["sha256"].to_pylist()
+
+
+def test_policies_that_are_named_as_examples_ship() -> None:
+    texts = (path.read_text().replace("TASK/", "PickCube-v1/") for path in TEXTS)
+    named = {found[0]: found[1] for text in texts for found in POLICY.finditer(text)}
+    assert named
+    for policy, task in named.items():
+        assert policy in files.read_index(data_folder(task) / files.INDEX)["id"].to_pylist()
 
 
 def test_there_are_checkpoints_and_results() -> None:

@@ -78,6 +78,17 @@ def checkpoint(name: str, task: str) -> Path | None:
     return folder if (folder / CONFIG).is_file() else None
 
 
+def is_ready(name: str, task: str) -> bool:
+    """Whether a method can be used for this task as it is: it needs no checkpoint, or one ships with the package."""
+    return not get(name).capabilities.checkpoint or checkpoint(name, task) is not None
+
+
+def no_checkpoint(name: str, task: str) -> UserError:
+    """What to raise for a method that is not ready; it names the command that trains one."""
+    train = f"nnit-bench train --method {name} --task {task}"
+    return UserError(f"no checkpoint of {name} for {task} ships with nnit; train one with: {train}")
+
+
 def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None, seed: int = 0) -> Generator:
     """The generator called `name`, ready to sample networks of `split` for the zoo's task.
 
@@ -95,10 +106,7 @@ def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None, s
         return generator
     found = source or checkpoint(name, zoo.task)
     if found is None:
-        raise UserError(
-            f"no checkpoint of {name} for {zoo.task} ships with nnit; "
-            f"train one with: nnit-bench train --method {name} --task {zoo.task}"
-        )
+        raise no_checkpoint(name, zoo.task)
     return kind.from_pretrained(found, zoo.task)
 
 

@@ -122,6 +122,8 @@ def run(
     )
     tasks = [_task(name, sim) for name in task]
     protocols = {each: [protocol_of(each, name) for name in split] for each in tasks}
+    if not checkpoint and not any(registry.is_ready(name, each) for name in method for each in task):
+        raise registry.no_checkpoint(method[0], task[0])
     zoos = {each: _zoo(each.name, screen) for each in tasks}
     results: list[tables.Results] = []
     errors: list[str] = []
@@ -219,6 +221,7 @@ def render(
     """
     found = _task(task, "fast")  # before what the simulator's extra brings is imported
 
+    from nnit_baselines import registry
     from nnit_bench import film, runner
     from nnit_bench.protocol import Protocol
     from nnit_bench.records import folder_name
@@ -228,6 +231,8 @@ def render(
 
     screen = Display(quiet)
     robot = film.robot_task(found)
+    if not checkpoint and not registry.is_ready(method, robot.name):
+        raise registry.no_checkpoint(method, robot.name)
     protocol = Protocol.of(robot, split, only=architecture, seed=seed)
     episode = protocol.select.first if episode_seed is None else episode_seed
     with camera(robot.name) as take:  # what cannot render is told before any other work

@@ -127,5 +127,10 @@ def resolve(name: str, runs: Sequence[StoredRun], task: str, split: str) -> Stor
 
 
 def command(method: str, task: str, split: str) -> str:
-    """The command that makes the run of a method."""
-    return f"nnit-bench run --method {method} --task {task} --split {split}"
+    """The command that makes the run of a method; two, if it has to be trained first."""
+    from nnit_baselines import registry  # noqa: PLC0415  imports torch, which stored runs do not need
+
+    run = f"nnit-bench run --method {method} --task {task} --split {split}"
+    if method not in registry.BUILT_IN or registry.is_ready(method, task):
+        return run
+    return f"nnit-bench train --method {method} --task {task}, then {run} --checkpoint runs/{method}/{task}"

@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from safetensors.torch import load_file
 from nnit_zoo import ghn_file
 from nnit_zoo.architecture import SPLITS, Architecture, architectures
 from nnit_zoo.atomic import write_atomically, write_json
-from nnit_zoo.build.selection import SELECTION_SCHEMA, is_yardstick, select
+from nnit_zoo.build.selection import POLICIES_PER_ARCHITECTURE, SELECTION_SCHEMA, is_yardstick, select
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import CANDIDATE_EPISODES, GHNS, INDEX, MANIFEST, SELECTION
@@ -33,7 +34,7 @@ from nnit_zoo.provenance import commit
 from nnit_zoo.tasks.task import Task
 
 ZOO = (GHNS, CANDIDATE_EPISODES, SELECTION, INDEX, MANIFEST)
-"""The files of a zoo that `pack` puts in place, in this order."""
+"""The files of a zoo that `pack` puts in place, in this order: with the last one there is a zoo."""
 
 
 def log(message: str) -> None:
@@ -139,16 +140,23 @@ class Builder(ABC):
         pq.write_table(pa.concat_tables(tables), whole / CANDIDATE_EPISODES, compression="zstd")
         pq.write_table(pa.Table.from_pylist(rows, SELECTION_SCHEMA), whole / SELECTION, compression="zstd")
         write_manifest(whole, self.task.standardisation)
+        record = json.loads((self.data / "task.json").read_text())
+        made = {stage: self._made(stage) for stage in ("states", "ghns", "scores")}
+        record["build"] |= {stage: json.loads(path.read_text()) for stage, path in made.items() if path.exists()}
+        (self.data / MANIFEST).unlink(missing_ok=True)  # without it there is no zoo: never a mixture of two
+        write_json(self.data / "task.json", record)
         for name in ZOO:
             write_atomically(self.data / name, partial(shutil.copyfile, whole / name))
         shutil.rmtree(whole)
         seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]
-        passed, kept = (sum(row[name] for row in seen) for name in ("passed", "kept"))
-        record = json.loads((self.data / "task.json").read_text())
-        made = {stage: self._made(stage) for stage in ("states", "ghns", "scores")}
-        record["build"] |= {stage: json.loads(path.read_text()) for stage, path in made.items() if path.exists()}
-        write_json(self.data / "task.json", record)
-        log(f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass, {kept:,} are kept")
+        passed = sum(row["passed"] for row in seen)
+        kept = Counter({row["architecture"]: 0 for row in seen})
+        kept.update(row["architecture"] for row in seen if row["kept"])
+        few = sum(count < POLICIES_PER_ARCHITECTURE for count in kept.values())
+        log(
+            f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass, {kept.total():,} are kept; "
+            f"of {few} of {len(kept)} architectures fewer than {POLICIES_PER_ARCHITECTURE}"
+        )
 
     @property
     def _sizes(self) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -222,6 +223,7 @@ def test_options_reach_the_work(
 
     monkeypatch.setattr(task, "evaluate", note)
     monkeypatch.setattr(registry, "get", lambda name: type(generator))
+    monkeypatch.setattr(registry, "is_ready", lambda *what: True)
     monkeypatch.setattr(registry, "prepare", lambda *how: generator)
     how = ["--workers", "3", "--parallel", "ray", "--sampling-steps", "2", "--protocol", "paper"]
     what = ["run", "--task", "Formula-v1", "--episodes", "2", "--policies", "1", *how, "--output", fresh, "--quiet"]
@@ -257,6 +259,17 @@ def test_mistakes_are_answered(
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ") and message in err and "Traceback" not in err
+
+
+@pytest.mark.parametrize("command", [("run", "--method", "nnit,nnit"), ("render", "--method", "nnit")])
+def test_a_method_that_must_be_trained_first_is_told_before_any_work(
+    call: Call, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "_zoo", Mock(side_effect=AssertionError))
+    assert call(*command, "--task", "StackCubeEasy-v1") == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "train one with: nnit-bench train --method nnit --task StackCubeEasy-v1" in told
 
 
 def test_what_needs_no_training_takes_no_checkpoint(

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from nnit_baselines import registry
 from nnit_bench import paper, results, tables
 from nnit_bench.protocol import Protocol, SeedRange
 from nnit_bench.records import Distance, Novelty
@@ -187,9 +188,16 @@ def test_shipped_runs_are_marked_and_give_way_to_newer_ones(
     assert chosen() == again.folder
 
 
-def test_a_missing_run_is_answered_with_its_command(store: Store, pick: Protocol) -> None:
-    found = [store("nnit", pick, outcomes(0.9, 80))]
-    with pytest.raises(UserError, match=r"run of nnit on PushCube-v1, seen; .* nnit --task PushCube-v1 --split seen"):
+def test_a_missing_run_is_answered_with_its_command(
+    store: Store, pick: Protocol, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = [store("nnit", pick, outcomes(0.9, 80)), store("crop", pick, outcomes(0.9, 80))]
+    command = "nnit-bench run --method crop --task PushCube-v1 --split seen$"
+    with pytest.raises(UserError, match=f"no stored run of crop on PushCube-v1, seen; make one with: {command}"):
+        results.resolve("crop", found, "PushCube-v1", "seen")
+    monkeypatch.setattr(registry, "CHECKPOINTS", Path("none"))
+    command = "nnit-bench train --method nnit --task PushCube-v1, then nnit-bench run --method nnit --task PushCube-v1"
+    with pytest.raises(UserError, match=f"{command} --split seen --checkpoint runs/nnit/PushCube-v1$"):
         results.resolve("nnit", found, "PushCube-v1", "seen")
     with pytest.raises(UserError, match=r"no stored method named 'nit': did you mean nnit\?; make it with: nnit-bench"):
         results.resolve("nit", found, "PickCube-v1", "unseen")
@@ -246,6 +254,7 @@ def test_our_row_stands_under_the_papers(store: Store, pick: Protocol, capsys: p
     assert rows["NNiT, seen"] == (None,) * 6
     assert "missing: nnit-bench run --method nnit --task PickCube-v1 --split seen" in table.notes
     assert "missing: SANE is not in this version of nnit" in table.notes
+    assert paper.PUSH_SCALE not in table.notes  # nothing is shown of that task
 
     (full,) = paper.full_distribution(results.latest(results.find(folders)))
     worst = run.record.results.estimates["success_at_end"]["worst"]
@@ -268,6 +277,7 @@ def test_the_papers_data_set_stands_over_the_mean_of_our_seen_policies(monkeypat
     assert (theirs.label, ours.label, ours.source) == ("Dataset, seen", "Dataset, seen", "here")
     assert [cell and cell.value for cell in theirs.cells[2:4]] == [42.02, 100]
     assert [cell and cell.value for cell in ours.cells] == [None, None, 39.2, 95, None, None]
+    assert paper.PUSH_SCALE in table.notes
 
 
 def test_what_the_generator_chose_stands_beside_the_papers(store: Store, pick: Protocol) -> None:

@@ -365,6 +365,26 @@ def test_a_zoo_is_in_place_until_another_is_whole_and_not_replaced_by_a_smaller_
         command.build(task="MNIST-PCA32", seeds=1, work=tmp_path)
 
 
+def test_a_zoo_is_never_a_mixture_of_two(builder, tmp_path, monkeypatch):
+    run_all(builder(tmp_path, "MNIST-PCA32"))
+    more = builder(tmp_path, "MNIST-PCA32")
+    more.seeds = range(3)
+    more.ghns()
+    more.scores()
+    write = common.write_atomically
+    for done in range(len(common.ZOO)):
+        writes = Mock(side_effect=[*[write] * done, KeyboardInterrupt])
+        with monkeypatch.context() as killing:
+            killing.setattr(common, "write_atomically", lambda *how, next_one=writes: next_one()(*how))
+            with pytest.raises(KeyboardInterrupt):
+                more.pack()
+        assert places.tasks_with_zoo() == ()
+    more.pack()
+    assert places.tasks_with_zoo() == ("MNIST-PCA32",)
+    materialise(data_folder("MNIST-PCA32"), tmp_path / "zoo")
+    assert set(Zoo.open(tmp_path / "zoo").index["ghn_seed"].to_pylist()) == {0, 1, 2}
+
+
 def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
     run_all(builder(tmp_path, "MNIST-PCA32"))
     more = builder(tmp_path, "MNIST-PCA32")

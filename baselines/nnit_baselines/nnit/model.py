@@ -36,8 +36,8 @@ class Transformer(nn.Module):
         self.level = level_embedding(width // 2 if settings.joint else width)
         self.architecture_level = level_embedding(width // 2) if settings.joint else None
         # Not in the paper, which modulates by the noise levels alone: a patch also knows, and is modulated by, the two
-        # widths that its layer joins. They decide how the GHN scales it; halves the distance to the zoo after equal
-        # training. The last pair stands for "no layer": architecture tokens.
+        # widths that its layer joins. They decide how the GHN scales it (what it gains: docs/nnit.md).
+        # The last pair stands for "no layer": architecture tokens.
         self.pairs = widths**2 + 1 if settings.width_conditioning else 0
         self.width_in = nn.Embedding(widths, width) if self.pairs else None
         self.width_out = nn.Embedding(widths, width) if self.pairs else None
@@ -45,7 +45,7 @@ class Transformer(nn.Module):
         self.modulation = Modulation(width, self.pairs, parts=2)
         # Not in the paper, which has one linear layer for all patches: each place on the grid has a layer of its own.
         # Networks of a GHN zoo are aligned, so what a place holds is learned apart from what the others hold, at no
-        # cost in operations; after equal training the distance to the zoo is less than half (docs/nnit.md).
+        # cost in operations (what it gains: docs/nnit.md).
         outputs = self.cells if settings.place_outputs else 1
         self.patch_out = nn.Parameter(torch.empty(outputs, width, channels * entries))
         self.widths_out = nn.Linear(width, channels * widths) if settings.joint else None
