@@ -13,8 +13,10 @@ from typing import Annotated
 import pyarrow as pa
 from cyclopts import Parameter
 
+from nnit_bench import scores
 from nnit_bench.protocol import policies_per_architecture
 from nnit_bench.records import RECORD, RunRecord, read_episodes
+from nnit_bench.scores import Summary
 from nnit_zoo.errors import UserError, unknown_name
 
 SHIPPED = Path(__file__).resolve().parents[2] / "leaderboard" / "results"
@@ -41,6 +43,14 @@ class StoredRun:
     def episodes(self) -> pa.Table:
         """The run's episodes; raises UserError if they are missing or damaged."""
         return read_episodes(self.folder)
+
+    @cached_property
+    def results(self) -> Summary | None:
+        """The run's statistics, computed anew: runs of different versions of nnit are summarised alike.
+
+        None if it has none; raises UserError as `episodes` does.
+        """
+        return scores.summarise(self.episodes, self.record.protocol) if self.record.results else None
 
     @property
     def is_shipped(self) -> bool:

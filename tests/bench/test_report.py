@@ -45,7 +45,7 @@ def joint_of(protocol: Protocol) -> Protocol:
 
 
 def test_every_number_stands_in_its_column(
-    store: Store, pick: Protocol, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    store: Store, pick: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = store("nnit", pick, outcomes(0.9, 80))
     assert run.record.results is not None
@@ -69,6 +69,7 @@ def test_every_number_stands_in_its_column(
     assert new == ["nnit", "50.0%", "(1.50)", "60.0%", "(1.60)", "0.700", "(1.70)", "8", "0.95"]
 
     record.write(run.folder)
+    monkeypatch.setattr(StoredRun, "results", found)
     report(folders=(tmp_path,), output=tmp_path / "report")
     row = "| nnit | 10.0 | 20.0 | 30.0 | 40.0 16-16-16-32 |  | 50.0% (1.50) |"
     assert row in (tmp_path / "report" / "report.md").read_text().splitlines()
@@ -278,6 +279,24 @@ def test_the_papers_data_set_stands_over_the_mean_of_our_seen_policies(monkeypat
     assert [cell and cell.value for cell in theirs.cells[2:4]] == [42.02, 100]
     assert [cell and cell.value for cell in ours.cells] == [None, None, 39.2, 95, None, None]
     assert paper.PUSH_SCALE in table.notes
+
+
+def test_runs_of_other_versions_are_summarised_alike(
+    store: Store, pick: Protocol, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What an earlier version wrote into run.json does not count: the episodes do."""
+    run = store("nnit", pick, outcomes(0.9, 80))
+    assert run.record.results is not None
+    estimates = {metric: {"mean": Estimate(0.5, 0.1, 2.0)} for metric in run.record.results.estimates}
+    old = run.record.model_copy(update={"results": replace(run.record.results, estimates=estimates)})
+    old.write(run.folder)
+    folders = (run.folder.parents[3],)
+    report(folders=folders, output=run.folder.parents[3] / "report", as_json=True)
+    (shown,) = json.loads(capsys.readouterr().out)
+    expected = run.record.results.estimates["success_at_end"]
+    assert shown["results"]["estimates"]["success_at_end"]["mean"]["high"] == expected["mean"].high
+    (table,) = paper.main_table(results.latest(results.find(folders)))
+    assert paper.Number.of(expected["top"], 100) in {cell for row in table.rows for cell in row.cells}
 
 
 def test_what_the_generator_chose_stands_beside_the_papers(store: Store, pick: Protocol) -> None:
