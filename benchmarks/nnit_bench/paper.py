@@ -184,7 +184,7 @@ def joint(runs: Latest) -> list[Table]:
     chosen = Table("NNiT appendix 'Architecture Diversity under Joint Sampling': PickCube-v1", columns)
     chosen.rows.append(Row("NNiT", "paper", tuple(Number(value) for value in JOINT_ARCHITECTURES)))
     run = runs.get((ROBOT_TASKS[0], "joint", METHODS["NNiT"]))
-    found = run and run.results and run.results.joint
+    found = run and run.summary and run.summary.joint
     numbers = (found.distinct, found.unseen, found.functional * 100, found.distinct_in_top) if found else None
     cells = tuple(map(Number, numbers)) if numbers else (None,) * len(columns)
     chosen.rows.append(Row("NNiT", "here", cells))
@@ -197,9 +197,9 @@ def mnist(runs: Latest) -> list[Table]:
     table.rows.append(Row("NNiT", "paper", tuple(Number(value) for value in MNIST_RESULTS)))
     cells: tuple[Number | None, ...] = (None, None)
     run = _find(table, runs, MNIST, "unseen", "NNiT")
-    if run and run.results:
+    if run and run.summary:
         accuracy = scores.everything(run.episodes, run.record.protocol).values[RETURN].mean(1)
-        mean = Number.of(run.results.estimates[RETURN]["mean"], 100)
+        mean = Number.of(run.summary.estimates[RETURN]["mean"], 100)
         cells = (mean, Number(int((accuracy > 0.8).sum())))
     table.rows.append(Row("NNiT", "here", cells))
     return [table]
@@ -228,8 +228,8 @@ def _ours(table: Table, runs: Latest, name: str, split: str, statistic: str) -> 
     cells: list[Number | None] = []
     for task in ROBOT_TASKS:
         run = _find(table, runs, task, split, name)
-        if run and run.results:
-            estimates = run.results.estimates
+        if run and run.summary:
+            estimates = run.summary.estimates
             cells += [Number.of(estimates[RETURN][statistic], 1), Number.of(estimates[SUCCESS][statistic], 100)]
         else:
             cells += [None, None]
@@ -250,7 +250,7 @@ def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> Store
         there = METHODS[name] in _methods()
         make = f"missing: {results.command(METHODS[name], task, split)}"
         table.notes.append(make if there else f"missing: {name} is not in this version of nnit")
-    elif run.results is None:
+    elif run.summary is None:
         table.notes.append(f"unsupported: {name} on {task}, {split}: {run.record.error}")
     elif not run.is_whole:
         table.notes.append(f"in part: the run of {name} on {task}, {split} has not all policies of the protocol")

@@ -68,7 +68,7 @@ def _grouped(runs: Sequence[StoredRun]) -> list[Group]:
 
 
 def _rank(run: StoredRun) -> tuple[float, str]:
-    found = run.results
+    found = run.summary
     return (-found.estimates[_headline(run).column]["mean"].value if found else 1.0), run.record.method.name
 
 
@@ -77,7 +77,7 @@ def _headline(run: StoredRun) -> Metric:
 
 
 def _plain(run: StoredRun) -> dict[str, Any]:
-    record = run.record.model_copy(update={"results": run.results})
+    record = run.record.model_copy(update={"results": run.summary})
     return {
         "folder": str(run.folder),
         "shipped": run.is_shipped,
@@ -91,8 +91,8 @@ def _csv(groups: Sequence[Group]) -> str:
     lines = csv.writer(text, lineterminator="\n")
     of_run = ["task", "split", "method", "run_id", "shipped"]
     lines.writerow([*of_run, "architecture", "metric", "statistic", "value", "low", "high"])
-    for run in (run for group in groups for run in group if run.results):
-        found = run.results
+    for run in (run for group in groups for run in group if run.summary):
+        found = run.summary
         assert found is not None
         protocol = run.record.protocol
         start = [protocol.task, protocol.split, run.record.method.name, run.record.run_id, run.is_shipped]
@@ -138,7 +138,7 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
 def _ties(group: Group) -> dict[Path, list[str]]:
     """The folder of each run -> the methods that it cannot be told apart from."""
     ties: dict[Path, list[str]] = {run.folder: [] for run in group}
-    for one, other in combinations((run for run in group if run.results), 2):
+    for one, other in combinations((run for run in group if run.summary), 2):
         if tied(one, other):
             ties[one.folder].append(other.record.method.label)
             ties[other.folder].append(one.record.method.label)
@@ -149,12 +149,12 @@ def _row(run: StoredRun, group: Group, metric: Metric, ties: Sequence[str]) -> s
     record = run.record
     marks = [*run.given, "upper bound" * record.method.oracle, "shipped" * run.is_shipped]
     name = ", ".join([record.method.label + _size(run, group), *filter(None, marks)])
-    if run.results is None:
+    if run.summary is None:
         return f"| {name} | {record.status}: {record.error} |" + " |" * 5
-    numbers = run.results.estimates[metric.column]
+    numbers = run.summary.estimates[metric.column]
     cells = [_cell(numbers.get(name), metric) for name in ("mean", "top", "top_heldout", "worst")]
-    if run.results.worst:
-        cells[-1] += f" {run.results.worst}"
+    if run.summary.worst:
+        cells[-1] += f" {run.summary.worst}"
     same = record.novelty and record.novelty.same_architecture
     ratio = "" if not same or same.ratio is None else f" ({same.ratio:.2f})"
     distance = f"{same.median:.1%}{ratio}" if same else "-"
@@ -185,7 +185,7 @@ def _figure_names(group: Group) -> tuple[str, str]:
 
 def _figures(groups: Sequence[Group]) -> Iterator[tuple[str, Figure]]:
     for group in groups:
-        scored = [run for run in group if run.results]
+        scored = [run for run in group if run.summary]
         if scored:
             by_architecture, top = _figure_names(group)
             if not scored[0].record.protocol.is_joint:
@@ -205,7 +205,7 @@ def _by_architecture(runs: Sequence[StoredRun]) -> Figure:
     axes = figure.subplots()
     step = 0.7 / len(runs)  # side by side, with a gap between architectures
     for number, run in enumerate(runs):
-        found = run.results
+        found = run.summary
         assert found is not None
         there = [(place, name) for place, name in enumerate(names) if name in found.architectures]
         of = [found.architectures[name][metric.column] for _, name in there]

@@ -45,7 +45,7 @@ class StoredRun:
         return read_episodes(self.folder)
 
     @cached_property
-    def results(self) -> Summary | None:
+    def summary(self) -> Summary | None:
         """The run's statistics, computed anew: runs of different versions of nnit are summarised alike.
 
         None if it has none; raises UserError as `episodes` does.

@@ -150,12 +150,11 @@ class Builder(ABC):
         shutil.rmtree(whole)
         seen = [row for row in rows if not is_yardstick(row["split"], row["ghn_seed"])]
         passed = sum(row["passed"] for row in seen)
-        kept = Counter({row["architecture"]: 0 for row in seen})
-        kept.update(row["architecture"] for row in seen if row["kept"])
-        few = sum(count < POLICIES_PER_ARCHITECTURE for count in kept.values())
+        kept = Counter(row["architecture"] for row in seen if row["kept"])
+        few = sum(kept[name] < POLICIES_PER_ARCHITECTURE for name in {row["architecture"] for row in seen})
         log(
             f"pack: {passed:,} of {len(seen):,} candidates of seen architectures pass, {kept.total():,} are kept; "
-            f"of {few} of {len(kept)} architectures fewer than {POLICIES_PER_ARCHITECTURE}"
+            f"{few} architectures have fewer than {POLICIES_PER_ARCHITECTURE}"
         )
 
     @property

@@ -265,6 +265,7 @@ def test_mistakes_are_answered(
 def test_a_method_that_must_be_trained_first_is_told_before_any_work(
     call: Call, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(registry, "CHECKPOINTS", Path("none"))
     monkeypatch.setattr(cli, "_zoo", Mock(side_effect=AssertionError))
     assert call(*command, "--task", "StackCubeEasy-v1") == 2
     told = capsys.readouterr().err

@@ -69,7 +69,7 @@ def test_every_number_stands_in_its_column(
     assert new == ["nnit", "50.0%", "(1.50)", "60.0%", "(1.60)", "0.700", "(1.70)", "8", "0.95"]
 
     record.write(run.folder)
-    monkeypatch.setattr(StoredRun, "results", found)
+    monkeypatch.setattr(StoredRun, "summary", found)
     report(folders=(tmp_path,), output=tmp_path / "report")
     row = "| nnit | 10.0 | 20.0 | 30.0 | 40.0 16-16-16-32 |  | 50.0% (1.50) |"
     assert row in (tmp_path / "report" / "report.md").read_text().splitlines()

@@ -101,7 +101,7 @@ def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder
         (common, "write_manifest"),
     ):
         with monkeypatch.context() as killing:
-            kill_second_call(killing, module, name)
+            kill_call(killing, module, name)
             with pytest.raises(KeyboardInterrupt):
                 run_all(builder(tmp_path / "killed"))
                 run_all(builder(tmp_path / "killed"))  # the last stage calls once a build
@@ -134,7 +134,7 @@ def test_a_killed_build_of_mnist_ends_with_the_same_bytes_and_a_zoo_with_accurac
     }
     for module, name in ((mnist, "train_ghn"), (MNISTPCA32, "evaluate"), (common, "write_manifest")):
         with monkeypatch.context() as killing:
-            kill_second_call(killing, module, name)
+            kill_call(killing, module, name)
             with pytest.raises(KeyboardInterrupt):
                 run_all(builder(tmp_path / "killed", "MNIST-PCA32"))
                 run_all(builder(tmp_path / "killed", "MNIST-PCA32"))
@@ -210,12 +210,12 @@ def test_a_build_that_cannot_be_says_why(options, message, monkeypatch, capsys):
     assert message in capsys.readouterr().err
 
 
-def kill_second_call(monkeypatch, module, name):
+def kill_call(monkeypatch, module, name, number=2):
     original, calls = getattr(module, name), []
 
     def wrapped(*args, **kwargs):
         calls.append(name)
-        if len(calls) == 2:
+        if len(calls) == number:
             raise KeyboardInterrupt
         return original(*args, **kwargs)
 
@@ -250,7 +250,7 @@ def test_twins_learn_the_same_from_seeds_of_their_own_and_go_on_after_a_kill(bui
     assert len(set(networks.values())) == 4 and set(networks) == {"GHN000", "GHN001", "SGD000", "SGD001"}
     for module, name in ((twins, "train"), (PickCube, "evaluate")):
         with monkeypatch.context() as killing:
-            kill_second_call(killing, module, name)
+            kill_call(killing, module, name)
             with pytest.raises(KeyboardInterrupt):
                 prepare(tmp_path / "killed").twins()
     prepare(tmp_path / "killed").twins()
@@ -371,11 +371,9 @@ def test_a_zoo_is_never_a_mixture_of_two(builder, tmp_path, monkeypatch):
     more.seeds = range(3)
     more.ghns()
     more.scores()
-    write = common.write_atomically
-    for done in range(len(common.ZOO)):
-        writes = Mock(side_effect=[*[write] * done, KeyboardInterrupt])
+    for number in range(1, len(common.ZOO) + 1):
         with monkeypatch.context() as killing:
-            killing.setattr(common, "write_atomically", lambda *how, next_one=writes: next_one()(*how))
+            kill_call(killing, common, "write_atomically", number)
             with pytest.raises(KeyboardInterrupt):
                 more.pack()
         assert places.tasks_with_zoo() == ()

@@ -220,9 +220,9 @@ def test_stats_are_printed_beside_the_papers_numbers(nnit_zoo: Command, tmp_path
     for name in ("magnitudes.png", "pairs.png"):
         assert str(tmp_path / "figures" / name) in stderr
         assert (tmp_path / "figures" / name).is_file()
-    of_three = nnit_zoo("stats")[1]  # the toy zoo has only one of those that are looked at by default
-    assert of_three == nnit_zoo("stats", "--architecture", "32-16-64-32")[1]
-    assert "46.940" in of_three
+    by_default = nnit_zoo("stats")[1]  # the toy zoo has only one of those that are looked at by default
+    assert by_default == nnit_zoo("stats", "--architecture", "32-16-64-32")[1]
+    assert "46.940" in by_default
     assert_error(nnit_zoo("stats", "--architecture", "64-64-64-32"), "at least two policies")
     assert_error(nnit_zoo("stats", "--architecture", "64-64-64-33"), "64-64-64-3")
 
