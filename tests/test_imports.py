@@ -1,6 +1,7 @@
-"""The packages import each other in one direction, and the command lines answer without heavy imports."""
+"""The packages import each other in one direction; the commands answer without heavy imports, and compute alike."""
 
 import ast
+import os
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -48,3 +49,12 @@ def test_help_imports_no_torch() -> None:
     code += f"; sys.stderr.write(str([name for name in {HEAVY} if name in sys.modules]))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "Usage" in done.stdout and done.stderr == "[]"
+
+
+def test_networks_do_not_depend_on_the_kind_of_x86_processor() -> None:
+    """All have AVX2; the kernels for AVX-512, which some would choose, round otherwise."""
+    code = "import sys; from nnit_bench.cli import main; sys.argv = ['nnit-bench', 'check', '--method', 'crop']"
+    code += "\ntry: main()\nfinally: import torch; print(torch.backends.cpu.get_cpu_capability())"
+    environment = {name: value for name, value in os.environ.items() if name != "ATEN_CPU_CAPABILITY"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split()[-1] == "AVX2"

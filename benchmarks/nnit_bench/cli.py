@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -273,6 +274,9 @@ def list_names(*, as_json: Json = False) -> None:
 
 def main() -> None:
     """Entry point of `nnit-bench`."""
+    # Before PyTorch's first operation: its kernels for AVX-512 round otherwise, and networks sampled on one processor
+    # would not be the same as on another.
+    os.environ.setdefault("ATEN_CPU_CAPABILITY", "avx2")
     run_application(app)
 
 

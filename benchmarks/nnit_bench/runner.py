@@ -6,8 +6,8 @@ import hashlib
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import torch
 
 from nnit_baselines import registry
 from nnit_baselines.generator import WEIGHTS, Capabilities, Generator, SampleRequest, check_batch
@@ -253,11 +254,14 @@ def zeroed(episodes: pa.Table) -> dict[str, int]:
 
 
 def sample(task: Task, entry: Entry, protocol: Protocol, stage: Stage) -> list[PolicyBatch]:
-    """The generated policies, one batch per architecture; raises UserError if the generator gives something else."""
+    """The generated policies, one batch per architecture; raises UserError if the generator gives something else.
+
+    PyTorch has one thread meanwhile: how it splits a sum among several changes its last digits.
+    """
     name, generator = entry.method.name, entry.generator
     assert generator is not None
     batches = []
-    with stage(f"{name}: sampling policies", protocol.size) as advance:
+    with _one_thread(), stage(f"{name}: sampling policies", protocol.size) as advance:
         for text, count in protocol.policies.items():
             seed = sample_seed(protocol.seed, text)
             if protocol.is_joint:
@@ -274,6 +278,16 @@ def sample(task: Task, entry: Entry, protocol: Protocol, stage: Stage) -> list[P
                 batches.append(batch)
             advance(count)
     return batches
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def sample_seed(seed: int, architecture: str) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 
 from nnit_baselines.controls.resized import Crop
 from nnit_bench import records, runner, scores
@@ -92,6 +93,25 @@ def test_an_architectures_policies_do_not_depend_on_the_others(task: Any, genera
     assert one.flat().equal(everything["64-64-64-16"].flat())
     reseeded = runner.sample(task, entry, alone.model_copy(update={"seed": 1}), silent)
     assert not one.flat().equal(reseeded[0].flat())
+
+
+def test_networks_do_not_depend_on_the_number_of_threads(task: Any, generator: Any, protocol: Protocol) -> None:
+    """Whatever a generator computes, sums are then in one order."""
+    seen: list[int] = []
+
+    class Watched(type(generator)):  # type: ignore[misc]
+        def sample(self, request: Any) -> Any:
+            seen.append(torch.get_num_threads())
+            return super().sample(request)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        runner.sample(task, entry_of(Watched()), protocol, silent)
+        after = torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+    assert set(seen) == {1} and after == 2
 
 
 def test_the_generator_chooses_on_joint(run: Run, task: Any) -> None:
