@@ -29,11 +29,14 @@ from nnit_zoo.build import builder, expert, mnist, robot
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.mnist import MNISTConfig
+from nnit_zoo.files import EXPERT
 from nnit_zoo.places import data_folder
 from nnit_zoo.sim import render
 from nnit_zoo.stats import ARCHITECTURES
 from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
+from nnit_zoo.tasks.push_cube import PushCube
+from nnit_zoo.tasks.task import PROBE
 from stand_in_hub import Hub, serving
 
 ROOT = Path(__file__).parents[1]
@@ -45,7 +48,11 @@ PROGRAMS = {"nnit-zoo": nnit_zoo.cli, "nnit-bench": nnit_bench.cli}
 BLOCK = re.compile(r"^```(\S*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 NOT_RUN = {"", "toml", "{toctree}", "{eval-rst}"}  # output, and what tools read
 INLINE = re.compile(r"`((?:nnit-zoo|nnit-bench) [^`]+)`")
-TASKS = ("PickCube-v1", "MNIST-PCA32")
+CHECKPOINTS = ("PickCube-v1", "MNIST-PCA32")
+GIVEN = {  # what a build would make first from the original digits, or by a training that PickCube-v1's shows
+    "MNIST-PCA32": ("task.json", FEATURES),
+    "PushCube-v1": ("task.json", EXPERT, PROBE),
+}
 FEW = {"seen": ("64-64-64-64", *ARCHITECTURES), "unseen": hidden_widths("unseen")[:2], "excluded": ("32-16-16-16",)}
 RUN_ID = "0123456789ab"  # of a run that a page supposes to be there
 
@@ -69,9 +76,10 @@ def steps(page: str) -> list[tuple[str, str]]:
 def toy_size(patch: pytest.MonkeyPatch, ghns: int) -> None:
     """A few steps of training, two episodes, policies of two architectures, few GHNs; and no processes to wait for."""
     patch.setattr(parallel, "_in_processes", lambda work, units, workers: ((unit, work(unit)) for unit in units))
-    patch.setattr(PickCube, "episodes", 2)
-    patch.setattr(PickCube, "scoring_seeds", range(2))
-    for kind in (PickCube, MNISTPCA32):
+    for kind in (PickCube, PushCube):
+        patch.setattr(kind, "episodes", 2)
+        patch.setattr(kind, "scoring_seeds", range(2))
+    for kind in (PickCube, PushCube, MNISTPCA32):
         patch.setattr(kind, "thresholds", dict.fromkeys(kind.thresholds, 0.0))  # nobody learns much
     patch.setattr(protocol, "policies_per_architecture", partial(few_policies, protocol.policies_per_architecture))
     patch.setattr(generator, "FitOptions", partial(few_training_steps, generator.FitOptions))
@@ -130,15 +138,16 @@ def shipped(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         toy_size(patch, ghns=3)  # a page has GHN seed 2
-        digits = place / "zoos" / "MNIST-PCA32"
-        digits.mkdir(parents=True)
-        for name in ("task.json", FEATURES):  # without the original digits, these are given
-            shutil.copy(data_folder("MNIST-PCA32") / name, digits)
+        for task, names in GIVEN.items():
+            (place / "zoos" / task).mkdir(parents=True)
+            for name in names:
+                shutil.copy(data_folder(task) / name, place / "zoos" / task)
         patch.setattr(places, "DATA", place / "zoos")
         tasks.get.cache_clear()  # a task keeps the record that it has read
         patch.setattr(places, "cached_assets_path", (place / "cache").joinpath)
-        for task in TASKS:
+        for task in ("PickCube-v1", *GIVEN):
             assert call(f"nnit-zoo build --task {task}", patch) == 0
+        for task in CHECKPOINTS:
             assert call(f"nnit-bench train --task {task} --output checkpoints/nnit/{task} --quiet", patch) == 0
         zoo = places.default_folder("PickCube-v1")
     yield SimpleNamespace(zoos=place / "zoos", checkpoints=place / "checkpoints", zoo=zoo)

@@ -16,7 +16,8 @@ Fewer than five drawn units say too little of how units differ: there is no inte
 Units may also be *given* instead of drawn, such as ten policies that were picked: then only episodes vary.
 
 If every episode went the same way there is nothing to resample; the open end of the interval is then Clopper and
-Pearson's exact bound for as many trials as there are episodes.
+Pearson's exact bound for as many trials as there are episodes. A table of one column, such as of means over episodes,
+says nothing of episodes: its interval is about units, and they are the trials.
 """
 
 from __future__ import annotations
@@ -107,7 +108,8 @@ def estimate(
         below, above = np.quantile(distances, TAILS).tolist()
         low, high = value - above * variance**0.5, value - below * variance**0.5
     else:
-        low, high = _exact(value, episodes, bounds) if bounds else (value, value)
+        trials = episodes if episodes > 1 else min(map(len, tables))
+        low, high = _exact(value, trials, bounds) if bounds else (value, value)
     if bounds:
         low, high = max(low, bounds[0]), min(high, bounds[1])
     return Estimate(value, low, high)

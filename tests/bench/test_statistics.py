@@ -116,6 +116,13 @@ def test_nothing_but_success_leaves_room_for_failure(value: float) -> None:
     assert (ours.low, ours.high) == pytest.approx((exact.low, exact.high))
 
 
+def test_means_without_episodes_count_their_units() -> None:
+    """100 policies of which each has succeeded in all of its episodes: 100 of 100, not 1 of 1."""
+    ours = mean(np.ones((100, 1)), None, np.random.default_rng(0), bounds=(0, 1))
+    exact = scipy.stats.binomtest(100, 100).proportion_ci(0.95, method="exact")
+    assert (ours.low, ours.high) == pytest.approx((exact.low, exact.high))
+
+
 @pytest.mark.parametrize(
     ("units", "drawn", "has"), [(1, True, False), (4, True, False), (5, True, True), (1, False, True)]
 )
