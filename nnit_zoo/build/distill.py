@@ -54,6 +54,11 @@ class DistillConfig(FitConfig):
     weight_noise: float = 0.05
 
 
+# The hardest task has the longest training, as in NNiT appendix D: it raised success at end, over 8 architectures of
+# each of two GHNs, from 92.0 to 94.5 %.
+CONFIG_BY_TASK = {"StackCubeEasy-v1": DistillConfig(steps=3000, own_rounds=4)}
+
+
 def standardise(task: RobotPolicyTask, observations: Array) -> Array:
     """Standardised observations [n, inputs], as every policy sees them."""
     return np.asarray((observations - task.observation_mean) / task.observation_std)

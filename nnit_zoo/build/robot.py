@@ -45,7 +45,8 @@ class RobotBuilder(Builder):
         super().__init__(task, work, seeds, workers, parallel)
         self.task: RobotPolicyTask = task
         self.expert_config = experts.CONFIG_BY_TASK.get(task.name, ExpertConfig())
-        self.distill_config, self.twins_config = DistillConfig(), TwinsConfig()
+        self.distill_config = distill.CONFIG_BY_TASK.get(task.name, DistillConfig())
+        self.twins_config = TwinsConfig()
 
     def expert(self) -> None:
         """Train the expert, then fix the task's standardisation from the states that it visits."""
