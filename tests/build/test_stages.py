@@ -1,4 +1,4 @@
-"""Building a zoo, at toy size: every artifact is there, and a killed build ends with the same bytes."""
+"""The stages of a build, at toy size: every artifact is there, and a killed build ends with the same bytes."""
 
 from __future__ import annotations
 
@@ -6,79 +6,25 @@ import json
 import shutil
 import sys
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import torch
 
-from nnit_zoo import files, places, stats, tasks
-from nnit_zoo.architecture import Architecture
+from nnit_zoo import stats
 from nnit_zoo.build import builder as common
-from nnit_zoo.build import command, distill, expert, mnist, robot, twins
-from nnit_zoo.build.distill import DistillConfig
-from nnit_zoo.build.expert import ExpertConfig
+from nnit_zoo.build import command, distill, expert, mnist, twins
 from nnit_zoo.build.fit import Fit
 from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.cli import main
 from nnit_zoo.errors import UserError
 from nnit_zoo.materialise import materialise
 from nnit_zoo.places import data_folder
-from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
+from nnit_zoo.tasks.mnist import MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
-from nnit_zoo.verify import rescore
 from nnit_zoo.zoo import Zoo
 
-TINY_EXPERT = ExpertConfig(total_steps=200, environments=2, hidden=16, epochs=1, minibatch=50, evaluate_every=1)
-TINY_DISTILL = DistillConfig(
-    rounds=2, episodes_per_round=2, round_steps=2, own_episodes=2, steps=3, architectures_per_step=2
-)
-TINY_FIT = mnist.MNISTConfig(steps=3, states_per_architecture=8)
-FEW = {"seen": ("16-32-64-16", "64-64-64-64"), "unseen": ("16-16-16-32",), "excluded": ("32-16-16-16",)}
-
-
-@pytest.fixture
-def builder(monkeypatch):
-    """A function that makes a toy builder whose data folder is in a folder of the test's."""
-    torch.set_num_threads(1)  # as `build` does; bits depend on it
-    monkeypatch.setattr(expert, "EVALUATION_SEEDS", range(2))
-    monkeypatch.setattr(PickCube, "scoring_seeds", range(2))
-    monkeypatch.setattr(common, "architectures", few_architectures)
-    shipped = data_folder("MNIST-PCA32")
-    forget = tasks.get.cache_clear
-
-    def make(folder, task="PickCube-v1", source=None):
-        monkeypatch.setattr(places, "DATA", folder / "data")
-        forget()  # a task keeps the record that it has read
-        if task == "MNIST-PCA32":
-            if not data_folder(task).exists():
-                data_folder(task).mkdir(parents=True)
-                for name in ("task.json", FEATURES):
-                    shutil.copy(shipped / name, data_folder(task))
-            built = mnist.MNISTBuilder(MNISTPCA32(), folder / "work", seeds=2, workers=1, source=source)
-            built.config = TINY_FIT
-        else:
-            built = robot.RobotBuilder(PickCube(), folder / "work", seeds=2, workers=1)
-            built.expert_config, built.distill_config = TINY_EXPERT, TINY_DISTILL
-        return built
-
-    yield make
-    forget()
-
-
-def few_architectures(split, inputs, outputs):
-    return tuple(Architecture.parse(text, inputs, outputs) for text in FEW[split])
-
-
-def run_all(builder):
-    for stage in builder.stages:
-        getattr(builder, stage)()
-
-
-def artifacts(folder):
-    given = ("task.json", FEATURES)
-    return {path.name: path.read_bytes() for path in folder.glob("data/*/*") if path.name not in given}
+from .conftest import TINY_EXPERT, TINY_FIT, artifacts, kill_call, run_all
 
 
 def test_a_build_that_was_killed_in_every_stage_ends_with_the_same_bytes(builder, tmp_path, monkeypatch):
@@ -210,18 +156,6 @@ def test_a_build_that_cannot_be_says_why(options, message, monkeypatch, capsys):
     assert message in capsys.readouterr().err
 
 
-def kill_call(monkeypatch, module, name, number=2):
-    original, calls = getattr(module, name), []
-
-    def wrapped(*args, **kwargs):
-        calls.append(name)
-        if len(calls) == number:
-            raise KeyboardInterrupt
-        return original(*args, **kwargs)
-
-    monkeypatch.setattr(module, name, wrapped)
-
-
 def test_a_stage_without_the_one_before_says_which_to_run(builder, tmp_path):
     with pytest.raises(UserError, match="stage 'expert' first"):
         builder(tmp_path).states()
@@ -263,55 +197,6 @@ def test_twins_learn_the_same_from_seeds_of_their_own_and_go_on_after_a_kill(bui
         assert set(stats.PAPER_TWINS["PickCube-v1"]) <= set(measures)
 
 
-def test_policies_that_cannot_enter_the_corpus_play_fewer_episodes(builder, tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "HELDOUT_SEEDS_FROM", 1)
-    monkeypatch.setattr(robot.RobotBuilder, "yardstick_episodes", 1)
-    built = builder(tmp_path)
-    run_all(built)
-    rows = pq.read_table(data_folder("PickCube-v1") / "selection.parquet").to_pylist()
-    played = {(row["architecture"], row["ghn_seed"]): row["episodes"] for row in rows}
-    assert played == {
-        (architecture, seed): 2 if split == "seen" and seed == 0 else 1
-        for split, listed in FEW.items()
-        for architecture in listed
-        for seed in (0, 1)
-    }
-    scores = pq.read_table(data_folder("PickCube-v1") / "scores.parquet").to_pylist()
-    first = [(row["ghn_seed"], row["seed"]) for row in scores if row["architecture"] == FEW["seen"][0]]
-    assert first == [(0, 0), (0, 1), (1, 0)]
-
-    monkeypatch.setattr(PickCube, "evaluate", None)
-    builder(tmp_path).scores()  # nothing is missing
-    monkeypatch.undo()
-
-    monkeypatch.setattr(tasks, "get", lambda name: built.task)
-    monkeypatch.setattr(PickCube, "scoring_seeds", range(2))
-    materialise(tmp_path / "data" / "PickCube-v1", tmp_path / "zoo")
-    episodes = []
-    rescored = rescore(tmp_path / "zoo", 9, episodes.append)
-    assert all(row["agrees"] and row["now_return"] == row["stored_return"] for row in rescored)
-    assert sum(episodes) == len(rescored) == 6  # of seed 1, and seed 0's of the other two architectures
-
-
-def test_scores_of_other_ghns_are_made_again(builder, tmp_path):
-    run_all(builder(tmp_path, "MNIST-PCA32"))
-    shutil.rmtree(tmp_path / "work" / "ghns")
-    better = builder(tmp_path, "MNIST-PCA32")
-    better.config = TINY_FIT.model_copy(update={"steps": 30})
-    better.ghns()
-    with pytest.raises(UserError, match="stage 'scores' first"):
-        better.pack()
-    better.scores()
-    better.pack()
-    materialise(data_folder("MNIST-PCA32"), tmp_path / "zoo")
-    zoo = Zoo.open(tmp_path / "zoo")
-    for row in zoo.index.to_pylist():
-        policy = zoo.batch(row["architecture"], row["split"])[row["row"]]
-        played = MNISTPCA32().evaluate([policy], range(100))["return"].to_numpy()
-        assert row["return"] == pytest.approx(played.mean())
-    assert json.loads((data_folder("MNIST-PCA32") / "task.json").read_text())["build"]["ghns"]["steps"] == 30
-
-
 def test_a_build_does_not_go_on_with_other_settings(builder, tmp_path):
     builder(tmp_path, "MNIST-PCA32").ghns()
     other = builder(tmp_path, "MNIST-PCA32")
@@ -343,62 +228,3 @@ def test_nothing_is_built_on_another_expert(builder, tmp_path):
     assert not (data_folder("PickCube-v1") / stats.TWINS).exists()  # they were the old one's students
     with pytest.raises(UserError, match="states was made with other settings"):
         builder(tmp_path).states()
-
-
-def test_a_zoo_is_in_place_until_another_is_whole_and_not_replaced_by_a_smaller_one(builder, tmp_path, monkeypatch):
-    run_all(builder(tmp_path, "MNIST-PCA32"))
-    before = artifacts(tmp_path)
-    more = builder(tmp_path, "MNIST-PCA32")
-    more.seeds = range(3)
-    more.ghns()
-    more.scores()
-    with monkeypatch.context() as killing:
-        killing.setattr(common, "write_manifest", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            more.pack()
-    assert artifacts(tmp_path) == before
-    sample = Path(__file__).parents[1] / "zoo" / "mnist"
-    with pytest.raises(UserError, match="was made for other features"):
-        builder(tmp_path, "MNIST-PCA32", source=str(sample)).features()
-    monkeypatch.setattr(mnist, "MNISTConfig", lambda: TINY_FIT)
-    with pytest.raises(UserError, match=r"is of 2 GHNs, and 1 would take their place; .* ghns\.safetensors, scores"):
-        command.build(task="MNIST-PCA32", seeds=1, work=tmp_path)
-
-
-def test_a_zoo_is_never_a_mixture_of_two(builder, tmp_path, monkeypatch):
-    run_all(builder(tmp_path, "MNIST-PCA32"))
-    more = builder(tmp_path, "MNIST-PCA32")
-    more.seeds = range(3)
-    more.ghns()
-    more.scores()
-    for number in range(1, len(common.ZOO) + 1):
-        with monkeypatch.context() as killing:
-            kill_call(killing, common, "write_atomically", number)
-            with pytest.raises(KeyboardInterrupt):
-                more.pack()
-        assert places.tasks_with_zoo() == ()
-    more.pack()
-    assert places.tasks_with_zoo() == ("MNIST-PCA32",)
-    materialise(data_folder("MNIST-PCA32"), tmp_path / "zoo")
-    assert set(Zoo.open(tmp_path / "zoo").index["ghn_seed"].to_pylist()) == {0, 1, 2}
-
-
-def test_scores_of_more_seeds_are_made_again(builder, tmp_path):
-    run_all(builder(tmp_path, "MNIST-PCA32"))
-    more = builder(tmp_path, "MNIST-PCA32")
-    more.seeds = range(3)
-    with pytest.raises(UserError, match="stage 'ghns' first"):
-        more.pack()
-    more.ghns()
-    more.scores()
-    more.pack()
-    assert set(pq.read_table(data_folder("MNIST-PCA32") / "scores.parquet")["ghn_seed"].to_pylist()) == {0, 1, 2}
-
-
-def test_the_scores_of_a_candidate_do_not_depend_on_which_stage_run_made_them(builder, tmp_path):
-    run_all(builder(tmp_path))
-    path = tmp_path / "work" / "scores" / "16-16-16-32.parquet"
-    before = pq.read_table(path)
-    path.unlink()
-    builder(tmp_path).scores()
-    assert pq.read_table(path).equals(before)
