@@ -169,6 +169,8 @@ def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> 
             for name in (files.EXPERT, files.GHNS, files.SELECTION, files.CANDIDATE_EPISODES):
                 if (data / name).is_file():  # MNIST-PCA32 has no expert
                     write_atomically(place / "build" / name, partial(shutil.copyfile, data / name))
+        else:
+            shutil.rmtree(place / "build", ignore_errors=True)  # of a zoo that was exported there before
         for split in by_split(zoo.index):
             write_atomically(folder / _path(zoo.task, split), partial(_write_policies, zoo, split))
     indexes = [(zoo.manifest, zoo.index) for zoo in zoos]

@@ -276,7 +276,7 @@ def card(*, task: Names = (), as_json: Json = False) -> None:
     """
     from nnit_zoo import places, summary
 
-    chosen = task or places.tasks_with_zoo()
+    chosen = dict.fromkeys(task) or places.tasks_with_zoo()
     if as_json:
         print_json([summary.describe(name) for name in chosen])
         return
@@ -303,10 +303,11 @@ def push(repository: str, *, task: Names = (), folder: Path | None = None, as_js
     from nnit_zoo.card import write_dataset
     from nnit_zoo.zoo import load
 
-    zoos = [load(name, folder) for name in task or places.tasks_with_zoo()]
+    zoos = {name: load(name, folder) for name in task or places.tasks_with_zoo()}
+    target = hub.Target(repository, zoos)  # what cannot be is told before the work
     with TemporaryDirectory() as place:
-        write_dataset(Path(place), zoos, repository)
-        commit = hub.push(repository, Path(place))
+        write_dataset(Path(place), list(zoos.values()), repository)
+        commit = target.push(Path(place))
     if as_json:
         print_json({"repository": repository, "commit": commit})
     else:

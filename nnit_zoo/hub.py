@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import httpx2
-from huggingface_hub import HfApi, HfFileSystem
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, HfFileSystem
 from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalTokenNotFoundError, OfflineModeIsEnabled
 from pydantic import ValidationError
 
@@ -95,19 +95,41 @@ class Source:
         return f"{self.address} is damaged, or changed meanwhile; run the same command again, or choose a --revision"
 
 
-def push(repository: str, folder: Path) -> str:
-    """Upload a folder as a data set of the Hub, made if it is not there; returns the address of the commit.
+class Target:
+    """A data set of the Hub that zoos of these tasks can be pushed to; it is made, and public, if it is not there.
 
     Raises UserError if it holds other zoos, which the new README would not list, or if the Hub refuses.
     """
-    with explained(repository):
-        hub = HfApi()
-        hub.create_repo(repository, repo_type="dataset", exist_ok=True)
-        there = [PurePosixPath(each.rfilename) for each in hub.dataset_info(repository).siblings or ()]
-        held = {path.parent.name for path in there if path.match(f"*/{MANIFEST}")}
-        if lost := sorted(held - {path.parent.name for path in folder.glob(f"*/{MANIFEST}")}):
+
+    def __init__(self, repository: str, tasks: Collection[str]) -> None:
+        if repository.count("/") != 1:
+            raise UserError(f"'{repository}' names no data set; write owner/name")
+        self._repository = repository
+        self._hub = HfApi()
+        with explained(repository):
+            self._hub.create_repo(repository, repo_type="dataset", exist_ok=True)
+            info = self._hub.dataset_info(repository)
+        self._earlier = info.sha
+        self._there = {PurePosixPath(each.rfilename) for each in info.siblings or ()}
+        held = {path.parent.name for path in self._there if path.match(f"*/{MANIFEST}")}
+        if lost := sorted(held - set(tasks)):
             raise UserError(f"{repository} also holds {', '.join(lost)}: name all of its tasks with --task")
-        return str(hub.upload_folder(repo_id=repository, folder_path=folder, repo_type="dataset"))
+
+    def push(self, folder: Path) -> str:
+        """Upload all of `folder` in one commit, which takes away what the tasks had else; returns its address."""
+        paths = {PurePosixPath(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
+        tasks = {path.parts[0] for path in paths if len(path.parts) > 1}
+        gone = sorted(path for path in self._there - set(paths) if path.parts[0] in tasks)
+        new = [CommitOperationAdd(str(name), path) for name, path in paths.items()]
+        with explained(self._repository):
+            commit = self._hub.create_commit(
+                self._repository,
+                [*new, *(CommitOperationDelete(str(name)) for name in gone)],
+                commit_message="Upload with nnit-zoo push",
+                repo_type="dataset",
+                parent_commit=self._earlier,  # refused if somebody else has pushed meanwhile
+            )
+        return str(commit.commit_url)
 
 
 @contextmanager
@@ -116,14 +138,12 @@ def explained(address: str) -> Iterator[None]:
     try:
         yield
     except OfflineModeIsEnabled:
-        raise UserError(
-            f"{address} cannot be reached, as HF_HUB_OFFLINE is set: unset it, or leave out --source"
-        ) from None
+        raise UserError(f"{address} cannot be reached, as HF_HUB_OFFLINE is set: unset it first") from None
     except LocalTokenNotFoundError:
         raise UserError("the Hub wants to know who you are; log in with: hf auth login") from None
     except (FileNotFoundError, EntryNotFoundError, NotImplementedError, ValueError) as error:
         raise UserError(f"nothing of that kind in {address}: {error}") from None
     except HfHubHTTPError as error:
         raise UserError(f"the Hub refuses {address}: {error}; log in with: hf auth login") from None
-    except httpx2.HTTPError as error:
+    except (httpx2.HTTPError, ConnectionError, TimeoutError, RuntimeError) as error:  # the last three from Xet
         raise UserError(f"the connection to {address} failed ({error}); run the same command again") from None

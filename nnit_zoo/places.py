@@ -6,13 +6,15 @@ import shlex
 from pathlib import Path
 
 import pyarrow as pa
-from huggingface_hub import cached_assets_path
+from huggingface_hub.constants import HF_ASSETS_CACHE
 
 from nnit_zoo import tasks
 from nnit_zoo.errors import UserError, unknown_name
 from nnit_zoo.files import INDEX, MANIFEST, Manifest, read_index
 
 DATA = Path(__file__).parent / "data"
+CACHE = Path(HF_ASSETS_CACHE).expanduser() / "nnit" / "zoo"
+"""Where zoos are put unless a folder is named: in the assets cache of huggingface_hub, which HF_HOME moves."""
 
 
 def data_folder(task: str) -> Path:
@@ -44,17 +46,11 @@ def _shipped(task: str) -> Path:
 
 
 def default_folder(task: str) -> Path:
-    """Where `nnit-zoo download` puts the task's zoo: in the assets cache of huggingface_hub (HF_HOME moves it).
-
-    Raises UserError if that folder cannot be made.
-    """
-    try:
-        return cached_assets_path("nnit", "zoo", task)
-    except (OSError, ValueError) as error:
-        raise UserError(f"no cache folder for zoos ({error}); set HF_HOME to a folder that you can write") from None
+    """Where `nnit-zoo download` puts the task's zoo."""
+    return CACHE / task
 
 
 def download_command(task: str, folder: Path) -> str:
     """The command that makes the zoo in `folder`, or mends it."""
-    where = "" if folder.resolve() == default_folder(task) else f" --folder {shlex.quote(str(folder))}"
+    where = "" if folder.resolve() == default_folder(task).resolve() else f" --folder {shlex.quote(str(folder))}"
     return f"nnit-zoo download --task {task}{where}"

@@ -100,6 +100,8 @@ class Handler(BaseHTTPRequestHandler):
                     self.server.files[match[1]][value["path"]] = base64.b64decode(value["content"])
                 elif operation["key"] == "lfsFile":
                     self.server.files[match[1]][value["path"]] = self.server.objects[value["oid"]]
+                elif operation["key"] == "deletedFile":
+                    del self.server.files[match[1]][value["path"]]
             address = f"{self.server.address}/datasets/{match[1]}/commit/{self.sha}"
             self.answer(200, {"commitUrl": address, "commitOid": self.sha, "hookOutput": ""})
         else:

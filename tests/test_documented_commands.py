@@ -25,7 +25,7 @@ from nnit_baselines.nnit.config import NNiTConfig
 from nnit_bench import protocol, results
 from nnit_zoo import parallel, places, tasks
 from nnit_zoo.architecture import Architecture, hidden_widths
-from nnit_zoo.build import builder, expert, mnist, robot
+from nnit_zoo.build import builder, distill, expert, mnist, robot
 from nnit_zoo.build.distill import DistillConfig
 from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.mnist import MNISTConfig
@@ -36,6 +36,7 @@ from nnit_zoo.stats import ARCHITECTURES
 from nnit_zoo.tasks.mnist import FEATURES, MNISTPCA32
 from nnit_zoo.tasks.pick_cube import PickCube
 from nnit_zoo.tasks.push_cube import PushCube
+from nnit_zoo.tasks.stack_cube_easy import StackCubeEasy
 from nnit_zoo.tasks.task import PROBE
 from stand_in_hub import Hub, serving
 
@@ -52,6 +53,7 @@ CHECKPOINTS = ("PickCube-v1", "MNIST-PCA32")
 GIVEN = {  # what a build would make first from the original digits, or by a training that PickCube-v1's shows
     "MNIST-PCA32": ("task.json", FEATURES),
     "PushCube-v1": ("task.json", EXPERT, PROBE),
+    "StackCubeEasy-v1": ("task.json", EXPERT, PROBE),
 }
 FEW = {"seen": ("64-64-64-64", *ARCHITECTURES), "unseen": hidden_widths("unseen")[:2], "excluded": ("32-16-16-16",)}
 RUN_ID = "0123456789ab"  # of a run that a page supposes to be there
@@ -76,10 +78,10 @@ def steps(page: str) -> list[tuple[str, str]]:
 def toy_size(patch: pytest.MonkeyPatch, ghns: int) -> None:
     """A few steps of training, two episodes, policies of two architectures, few GHNs; and no processes to wait for."""
     patch.setattr(parallel, "_in_processes", lambda work, units, workers: ((unit, work(unit)) for unit in units))
-    for kind in (PickCube, PushCube):
+    for kind in (PickCube, PushCube, StackCubeEasy):
         patch.setattr(kind, "episodes", 2)
         patch.setattr(kind, "scoring_seeds", range(2))
-    for kind in (PickCube, PushCube, MNISTPCA32):
+    for kind in (PickCube, PushCube, StackCubeEasy, MNISTPCA32):
         patch.setattr(kind, "thresholds", dict.fromkeys(kind.thresholds, 0.0))  # nobody learns much
     patch.setattr(protocol, "policies_per_architecture", partial(few_policies, protocol.policies_per_architecture))
     patch.setattr(generator, "FitOptions", partial(few_training_steps, generator.FitOptions))
@@ -90,6 +92,7 @@ def toy_size(patch: pytest.MonkeyPatch, ghns: int) -> None:
     few_steps = {"total_steps": 200, "environments": 2, "hidden": 16, "epochs": 1, "minibatch": 50}
     patch.setattr(robot, "ExpertConfig", partial(ExpertConfig, **few_steps, evaluate_every=1))
     few_steps = {"rounds": 1, "episodes_per_round": 2, "round_steps": 2, "own_episodes": 2, "steps": 3}
+    patch.setattr(distill, "CONFIG_BY_TASK", {})
     patch.setattr(robot, "DistillConfig", partial(DistillConfig, **few_steps, architectures_per_step=2))
     patch.setattr(mnist, "MNISTConfig", partial(MNISTConfig, steps=3, states_per_architecture=8))
     start = builder.Builder.__init__
@@ -144,7 +147,7 @@ def shipped(tmp_path_factory):
                 shutil.copy(data_folder(task) / name, place / "zoos" / task)
         patch.setattr(places, "DATA", place / "zoos")
         tasks.get.cache_clear()  # a task keeps the record that it has read
-        patch.setattr(places, "cached_assets_path", (place / "cache").joinpath)
+        patch.setattr(places, "CACHE", place / "cache")
         for task in ("PickCube-v1", *GIVEN):
             assert call(f"nnit-zoo build --task {task}", patch) == 0
         for task in CHECKPOINTS:
@@ -161,7 +164,7 @@ def machine(shipped, tmp_path, monkeypatch):
     shutil.copytree(shipped.zoos, tmp_path / "zoos")  # where `nnit-zoo build` writes, too
     monkeypatch.setattr(places, "DATA", tmp_path / "zoos")
     tasks.get.cache_clear()
-    monkeypatch.setattr(places, "cached_assets_path", (tmp_path / "cache").joinpath)
+    monkeypatch.setattr(places, "CACHE", tmp_path / "cache")
     monkeypatch.setattr(registry, "CHECKPOINTS", shipped.checkpoints)
     find = results.find
     monkeypatch.setattr(results, "find", lambda folders: find(set(folders) - {results.SHIPPED}))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nnit_baselines.card import card
 from nnit_zoo.architecture import Architecture
-from nnit_zoo.atomic import write_bytes, write_json
+from nnit_zoo.atomic import write_bytes
 from nnit_zoo.errors import UserError
 from nnit_zoo.hub import explained
 from nnit_zoo.policy import PolicyBatch
@@ -155,9 +155,8 @@ class Generator(ABC):
         config = {"method": kind.__name__, "task": self.task, "training": dict(self.training_facts)}
         if taken := sorted(config.keys() & own.keys()):
             raise UserError(f"config() of {kind.__name__} has the reserved key {taken[0]}; give it another name")
-        config, tensors = config | own, self.tensors()
-        write_bytes(folder / WEIGHTS, safetensors.torch.save(tensors, METADATA))
-        write_json(folder / CONFIG, config)
+        content = json.dumps(config | own, indent=2) + "\n"
+        weights = safetensors.torch.save(self.tensors(), METADATA)
         text = card(
             kind.__name__,
             address(kind),
@@ -166,7 +165,10 @@ class Generator(ABC):
             training=self.training_facts,
             licence=self.licence,
         )
+        (folder / CONFIG).unlink(missing_ok=True)  # written last, it says that the checkpoint is whole
+        write_bytes(folder / WEIGHTS, weights)
         write_bytes(folder / CARD, text.encode())
+        write_bytes(folder / CONFIG, content.encode())
 
     @classmethod
     def from_pretrained(cls, source: Path | str, task: str | None = None) -> Self:
@@ -223,6 +225,8 @@ def check_batch(name: str, batch: object) -> PolicyBatch:
 
 def _fetch(source: Path | str) -> Path:
     """The local folder of a checkpoint; what is not a folder is taken for a Hub id."""
+    if source == "":
+        raise UserError("the checkpoint's name is empty; give a folder, or an id on the Hugging Face Hub")
     if Path(source).is_dir():
         return Path(source)
     if isinstance(source, Path) or Path(source).is_absolute():

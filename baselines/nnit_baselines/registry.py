@@ -104,7 +104,7 @@ def prepare(name: str, zoo: Zoo, split: str, source: Path | str | None = None, s
             zoo.reference_view(split) if kind.capabilities.oracle else zoo.training_view(), FitOptions(seed=seed)
         )
         return generator
-    found = source or checkpoint(name, zoo.task)
+    found = checkpoint(name, zoo.task) if source is None else source
     if found is None:
         raise no_checkpoint(name, zoo.task)
     return kind.from_pretrained(found, zoo.task)

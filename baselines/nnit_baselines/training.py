@@ -34,6 +34,7 @@ def train(generator: Generator, zoo: Zoo, options: FitOptions, output: Path, pre
     output.mkdir(parents=True, exist_ok=True)  # what cannot be written to is told before the work
     view = zoo.training_view()
     generator.fit(view, options)
+    generator.task = zoo.task  # also if its author forgot
     generator.training_facts = {
         **generator.training_facts,
         "seed": options.seed,

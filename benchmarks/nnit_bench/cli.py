@@ -113,7 +113,7 @@ def run(
 
     for name in method:
         runner.code_of(registry.get(name))  # a wrong name is told now, and what a file holds now is what counts
-    if checkpoint and len(method) * len(task) > 1:
+    if checkpoint is not None and len(method) * len(task) > 1:
         raise UserError("--checkpoint belongs to one --method and one --task")
     if execution.workers < 1:
         raise UserError(f"--workers must be 1 or more, not {execution.workers}")
@@ -123,7 +123,7 @@ def run(
     )
     tasks = [_task(name, sim) for name in task]
     protocols = {each: [protocol_of(each, name) for name in split] for each in tasks}
-    if not checkpoint and not any(registry.is_ready(name, each) for name in method for each in task):
+    if checkpoint is None and not any(registry.is_ready(name, each) for name in method for each in task):
         raise registry.no_checkpoint(method[0], task[0])
     zoos = {each: _zoo(each.name, screen) for each in tasks}
     results: list[tables.Results] = []
@@ -171,12 +171,14 @@ def train(
     """
     from nnit_baselines import training
     from nnit_baselines.generator import FitOptions
+    from nnit_bench.protocol import check_seed
     from nnit_bench.records import folder_name
     from nnit_zoo import tasks
     from nnit_zoo.display import Display
 
     if steps is not None and steps < 1:
         raise UserError(f"--steps must be 1 or more, not {steps}")
+    check_seed(seed)
     task = tasks.get(task).name
     generator = training.untrained(method, preset)  # a wrong name is told before the zoo is made
     folder = output or Path("runs") / folder_name(method) / task
@@ -232,7 +234,7 @@ def render(
 
     screen = Display(quiet)
     robot = film.robot_task(found)
-    if not checkpoint and not registry.is_ready(method, robot.name):
+    if checkpoint is None and not registry.is_ready(method, robot.name):
         raise registry.no_checkpoint(method, robot.name)
     protocol = Protocol.of(robot, split, only=architecture, seed=seed)
     episode = protocol.select.first if episode_seed is None else episode_seed

@@ -185,7 +185,7 @@ def in_words(first: str, second: str, difference: Difference, metric: Metric) ->
     unit = " points" if metric.unit == "%" else ""
     value, interval = difference.difference.text(metric.scale, signed=True)
     if not interval and difference.first == difference.second:
-        return f"{first} and {second} do the same in every episode: nothing tells them apart in mean {metric.label}."
+        return f"{first} and {second} have the same mean {metric.label}, and no interval: nothing tells them apart."
     if not interval:
         return (
             f"{first} and {second} cannot be told apart in mean {metric.label}: "

@@ -113,9 +113,12 @@ def _action_distance(task: Task, states: Tensor, policies: PolicyBatch, known: P
 
 
 def _behaviour(task: Task, states: Tensor, batch: PolicyBatch) -> Tensor:
-    """What each policy does on all states, [n, states x outputs]; a few policies at a time stay in the cache."""
+    """What each policy does on all states, [n, states x outputs]; a few policies at a time stay in the cache.
+
+    Huge weights overflow: no number counts as 0, as in an episode.
+    """
     parts = [batch[start : start + 16](states[None]) for start in range(0, len(batch), 16)]
-    return task.behaviour(torch.cat(parts)).flatten(1)
+    return task.behaviour(torch.cat(parts).nan_to_num()).flatten(1)
 
 
 @dataclass(frozen=True)

@@ -111,8 +111,7 @@ class Protocol(_Frozen):
     def _sizes(self) -> Protocol:
         if not self.policies or min(self.policies.values()) < 0 or max(self.policies.values()) < 1:
             raise UserError("there is nothing to score: --policies must be 1 or more")
-        if not 0 <= self.seed < 2**31:
-            raise UserError(f"--seed must be from 0 to {2**31 - 1}, not {self.seed}")
+        check_seed(self.seed)
         return self
 
     @classmethod
@@ -155,6 +154,12 @@ class Protocol(_Frozen):
         """Whether scores under both may be compared, on the episodes and architectures that both have."""
         kept = {"version", "task", "task_version", "simulator", "metrics", "split"}
         return self.model_dump(include=kept) == other.model_dump(include=kept)
+
+
+def check_seed(seed: int) -> None:
+    """Raise UserError for a seed that PyTorch, NumPy and the run's record cannot all hold."""
+    if not 0 <= seed < 2**31:
+        raise UserError(f"--seed must be from 0 to {2**31 - 1}, not {seed}")
 
 
 def architectures(split: str) -> tuple[str, ...]:

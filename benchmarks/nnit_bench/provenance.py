@@ -12,10 +12,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, distributions, version
 from importlib.util import find_spec
 from modulefinder import ModuleFinder
 from pathlib import Path
+from typing import Any
 
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import sha256_of
@@ -25,6 +27,8 @@ OUR_PACKAGES = ("nnit_zoo", "nnit_baselines", "nnit_bench")
 """The packages whose source files are hashed into a run's id."""
 NUMERIC_PACKAGES = ("torch", "numpy", "mani_skill", "sapien")
 """The packages whose versions can change a number; the record lists all that are installed."""
+FOLDER = 5
+"""What `modulefinder` calls a package."""
 
 
 @dataclass(frozen=True)
@@ -76,17 +80,18 @@ def hash_files(files: Mapping[str, Path]) -> str:
 def plugin_files(module: str) -> dict[str, Path]:
     """Name -> source file of what a method in this loaded module is made of.
 
-    A package is all its files; a single file is itself and what it imports from beside it. Raises UserError if another
-    method's module was loaded in place of one of these.
+    A package is all its files, data too; a single file is itself and what it imports from beside it. Raises UserError
+    if another method's module was loaded in place of one of these.
     """
     top = sys.modules[module.partition(".")[0]]
     if hasattr(top, "__path__"):
         roots = [Path(each) for each in top.__path__]
-        return {f"{root.name}/{path.relative_to(root)}": path for root in roots for path in root.rglob("*.py")}
+        found = {f"{root.name}/{path.relative_to(root)}": path for root in roots for path in root.rglob("*")}
+        return {name: path for name, path in found.items() if path.is_file() and path.suffix != ".pyc"}
     file = Path(inspect.getfile(top))
     if file.parent.name in ("site-packages", "dist-packages"):  # what is beside it is not its own
         return {file.name: file}
-    finder = ModuleFinder([str(file.parent)], excludes=OUR_PACKAGES)
+    finder = _Finder([str(file.parent)], excludes=OUR_PACKAGES)
     finder.run_script(str(file))
     found = {name: Path(each) for name, module in finder.modules.items() if (each := vars(module)["__file__"])}
     for name, path in found.items():
@@ -94,6 +99,25 @@ def plugin_files(module: str) -> dict[str, Path]:
         if name != "__main__" and loaded is not None and Path(loaded).resolve() != path.resolve():
             raise UserError(f"{file} needs {path}, but {loaded} of that name is loaded; use a command for each of them")
     return {str(path.relative_to(file.parent)): path for path in found.values()}
+
+
+class _Finder(ModuleFinder):
+    """Also follows imports from a folder without `__init__.py`, which `ModuleFinder` stumbles over."""
+
+    def find_module(self, name: str, path: Any, parent: Any = None) -> Any:
+        """File, path and kind of a module; raises ImportError if there is none."""
+        spec = PathFinder.find_spec(name, self.path if path is None else path)
+        if spec is None or spec.origin is not None or spec.submodule_search_locations is None:
+            return super().find_module(name, path, parent)
+        return None, next(iter(spec.submodule_search_locations)), ("", "", FOLDER)
+
+    def load_package(self, fqname: str, pathname: str) -> Any:
+        """The package in a folder, and what it imports."""
+        if (Path(pathname) / "__init__.py").is_file():
+            return super().load_package(fqname, pathname)
+        module: Any = self.add_module(fqname)
+        module.__path__ = [pathname]
+        return module
 
 
 @cache  # files that change while a command runs are not what runs

@@ -118,7 +118,7 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
             "known seed has for the architecture; in brackets as a multiple of that of held-out seeds. "
             "`shipped`: run by the project, not here.\n"
         )
-        best = f"top-{protocol.top}"
+        best = f"top-{max(run.record.protocol.best for run in group)}"
         heading = ["method", "mean", best, "held out", "worst architecture", "tied with", "nearest known"]
         parts.append("| " + " | ".join(heading) + " |\n|---|" + "---:|" * (len(heading) - 1))
         ties = _ties(group)

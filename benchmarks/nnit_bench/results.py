@@ -14,9 +14,10 @@ import pyarrow as pa
 from cyclopts import Parameter
 
 from nnit_bench import scores
-from nnit_bench.protocol import policies_per_architecture
+from nnit_bench.protocol import architectures, policies_per_architecture
 from nnit_bench.records import RECORD, RunRecord, read_episodes
 from nnit_bench.scores import Summary
+from nnit_zoo import tasks
 from nnit_zoo.errors import UserError, unknown_name
 
 SHIPPED = Path(__file__).resolve().parents[2] / "leaderboard" / "results"
@@ -127,6 +128,11 @@ def resolve(name: str, runs: Sequence[StoredRun], task: str, split: str) -> Stor
     mine = [run for run in runs if run.record.method.name == name and run.record.status == "success"]
     found = latest(mine).get((task, split, name))
     if found is None:
+        if "/" in name and ":" not in name:
+            raise UserError(f"no run in {name}: there is no {RECORD}")
+        if task not in {run.record.protocol.task for run in runs}:
+            tasks.get(task)  # a wrong name is told
+        architectures(split)
         methods = {run.record.method.name for run in runs}
         if name not in methods and "/" not in name and ":" not in name:
             raise UserError(

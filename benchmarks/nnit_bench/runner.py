@@ -93,7 +93,8 @@ def enter(
         reason = f"the zoo has no policies of the split {protocol.split}"
     if reason:
         return Entry(_without_checkpoint(name, able, given), code, None, reason, 0.0)
-    generator = registry.prepare(name, zoo, protocol.split, checkpoint, protocol.seed)
+    with _one_thread():
+        generator = registry.prepare(name, zoo, protocol.split, checkpoint, protocol.seed)
     if sampling_steps is not None:
         set_sampling_steps(name, generator, sampling_steps)
     method = describe(name, generator, given)
@@ -163,7 +164,7 @@ def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execu
         method=entry.method,
         zoo_sha256=sha256,
         code_sha256=entry.code.sha256,
-        packages=numeric_packages(),
+        packages=numeric_packages() | _gpu(),
     )
     folder = identity.folder(execution.output)
     if earlier := _earlier(folder, execution.overwrite):
@@ -180,6 +181,11 @@ def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execu
         record.stop(folder, "failed", str(error) or type(error).__name__)
         raise
     return Outcome(record, folder, reused=False, zeroed=zeroed(records.read_episodes(folder)))
+
+
+def _gpu() -> dict[str, str]:
+    """The GPU that a method may have sampled on, which rounds otherwise; empty without one."""
+    return {"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
 
 
 def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:

@@ -175,7 +175,7 @@ def of_means(means: Scores, protocol: Protocol) -> tuple[dict[str, dict[str, Est
     """
     worst = worst_architecture(means, protocol.metrics)
     lowest = means.of(means.policies[means.architectures == worst])
-    best = means.of(ranked(means, protocol.metrics)[: protocol.top])
+    best = means.of(ranked(means, protocol.metrics)[: protocol.best])
     estimates: dict[str, dict[str, Estimate]] = {}
     for metric in protocol.metrics:
         top = float(best.values[metric.column].mean())

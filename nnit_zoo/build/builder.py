@@ -185,7 +185,7 @@ class Builder(ABC):
     def _sign(self, stage: str, settings: dict[str, Any], *, works: bool) -> dict[str, Any]:
         """Keep and give the stage's record; raises UserError if what is there was made otherwise, or without one."""
         path, settings = self._made(stage), json.loads(json.dumps(settings))
-        if not path.exists() and path.parent.is_dir() and any(path.parent.iterdir()):
+        if not path.exists() and any(path.parent.glob("[!.]*")):  # a dot begins what a kill left half-written
             raise UserError(f"{path.parent} has no {path.name} that says how its files were made; move it elsewhere")
         made: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {**settings, "commits": []}
         if {name: value for name, value in made.items() if name != "commits"} != settings:
@@ -194,6 +194,11 @@ class Builder(ABC):
             made["commits"].append(now)
         write_json(path, made)
         return made
+
+    def _other_zoo(self, how: str) -> UserError:
+        """What to raise if the zoo that is there was made otherwise, `how`, and would be left without its origin."""
+        first = f"first move elsewhere, from there, {', '.join(ZOO)}"
+        return UserError(f"the zoo in {self.data} was made {how}; if that is meant, {first}")
 
     @property
     def _units(self) -> Path:

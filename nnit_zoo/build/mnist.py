@@ -22,7 +22,7 @@ from safetensors.numpy import save as serialise
 from torch import nn
 
 from nnit_zoo.atomic import write_atomically, write_bytes, write_json
-from nnit_zoo.build.builder import ZOO, Builder, log
+from nnit_zoo.build.builder import Builder, log
 from nnit_zoo.build.fit import Fit, FitConfig, save_ghn
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import MANIFEST, sha256_of
@@ -184,10 +184,7 @@ class MNISTBuilder(Builder):
         made = self.work / "features" / FEATURES
         constants, facts = build_features(self.source, made)
         if (self.data / MANIFEST).exists() and sha256_of(made) != sha256_of(self.data / FEATURES):
-            raise UserError(
-                f"the zoo in {self.data} was made for other features than those of {self.source}; "
-                f"if that is meant, first move elsewhere, from there, {', '.join(ZOO)}"
-            )
+            raise self._other_zoo(f"for other features than those of {self.source}")
         write_atomically(self.data / FEATURES, partial(shutil.copyfile, made))
         content = {"name": self.task.name, "version": self.task.version, **constants}
         write_json(target, {**content, "build": {**earlier, "features": {**facts, "commit": str(commit())}}})

@@ -23,7 +23,7 @@ from nnit_zoo.build.expert import ExpertConfig
 from nnit_zoo.build.twins import TwinsConfig
 from nnit_zoo.display import Display
 from nnit_zoo.errors import UserError
-from nnit_zoo.files import EXPERT, sha256_of
+from nnit_zoo.files import EXPERT, MANIFEST, sha256_of
 from nnit_zoo.parallel import Backend, unordered
 from nnit_zoo.tasks.robot import RobotPolicyTask
 from nnit_zoo.tasks.task import PROBE
@@ -53,6 +53,8 @@ class RobotBuilder(Builder):
         if (self.data / EXPERT).exists():
             log("expert: done")
             return
+        if (self.data / MANIFEST).exists():
+            raise self._other_zoo("by another expert")
         made = self._sign("expert", self.expert_config.model_dump(), works=True)
         record = experts.train(self.task, self.expert_config, self.work / "expert", self.workers, log)
         network = experts.load(self.work / "expert" / EXPERT)
@@ -89,7 +91,8 @@ class RobotBuilder(Builder):
         """Regression onto the expert, on the buffer and on states of the GHN's own."""
         self._require_states()
         train = partial(distill.train_ghn, self.task, self.distill_config, self._expert(), self._states)
-        return train, {**self.distill_config.model_dump(), "states": self._count_states()}
+        buffer = {"states": self._count_states(), "states_sha256": sha256_of(self._states)}
+        return train, {**self.distill_config.model_dump(), **buffer}
 
     def made_from(self) -> dict[str, str]:
         """The expert, and what the states that it visits standardise observations by."""
@@ -103,7 +106,8 @@ class RobotBuilder(Builder):
         seeds = range(config.networks)
         paths = {kind: [folder / kind / f"{seed:03d}.safetensors" for seed in seeds] for kind in twins.KINDS}
         missing = [(path, kind) for kind in twins.KINDS for path in paths[kind] if not path.exists()]
-        made = self._sign("twins", {**config.model_dump(), **self.made_from()}, works=bool(missing))
+        settings = {**config.model_dump(), **self.made_from(), "states_sha256": sha256_of(self._states)}
+        made = self._sign("twins", settings, works=bool(missing))
         train = partial(twins.train, self.task, config, self._expert(), self._states)
         with Display(quiet=False).stage("twins", len(missing)) as advance:
             for _, line in unordered(lambda unit: train(*unit), missing, self.workers):

@@ -138,6 +138,17 @@ def test_a_wrong_method_gets_an_answer(name, message, plugin):
         registry.get(name.format(plugin=plugin))
 
 
+def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(plugin, tmp_path, monkeypatch):
+    kind = registry.get(f"{plugin}:Constant")
+    made = kind()
+    made.task, made.value = "Push", 1.0
+    made.save_pretrained(tmp_path)
+    made.value, made.training_facts = 2.0, {"loss": torch.ones(())}
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        made.save_pretrained(tmp_path)
+    assert kind.from_pretrained(tmp_path, "Push").value == 1.0
+
+
 def test_a_checkpoint_comes_back_for_its_own_task_only(plugin, tmp_path):
     kind = registry.get(f"{plugin}:Constant")
     made = kind()
@@ -159,6 +170,8 @@ def test_a_missing_or_damaged_checkpoint_gets_an_answer(plugin, tmp_path):
     with pytest.raises(UserError, match="no checkpoint folder"):
         kind.from_pretrained(tmp_path / "nowhere")
     kind().save_pretrained(tmp_path / "saved")
+    with pytest.raises(UserError, match="name is empty; give a folder"):
+        kind.from_pretrained("")
     (tmp_path / "saved" / WEIGHTS).write_bytes(b"half a fi")
     with pytest.raises(UserError, match="cannot be read"):
         kind.from_pretrained(tmp_path / "saved")

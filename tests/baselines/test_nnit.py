@@ -241,6 +241,14 @@ def test_another_seed_gives_another_model_and_refuses_the_state(view, tmp_path):
         second.fit(view, FitOptions(seed=1, folder=tmp_path))
 
 
+def test_changed_code_of_nnit_refuses_the_state(view, tmp_path, monkeypatch):
+    """A finished training would be given the new code's name."""
+    NNiT(PACKED).fit(view, FitOptions(seed=0, folder=tmp_path / "state"))
+    monkeypatch.setattr(training, "__file__", str(tmp_path / "nnit" / "training.py"))
+    with pytest.raises(UserError, match="or by other code of NNiT"):
+        NNiT(PACKED).fit(view, FitOptions(seed=0, folder=tmp_path / "state"))
+
+
 @pytest.mark.parametrize(("decay", "half"), [("linear", 6.5e-5), ("cosine", 6.5e-5)])
 def test_the_learning_rate_rises_then_falls_to_its_last_value(decay, half):
     settings = NNiTConfig(decay=decay, learning_rate=1e-4, last_learning_rate=3e-5, warmup=500, steps=10_000)

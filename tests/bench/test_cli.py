@@ -117,7 +117,9 @@ def test_a_changed_plug_in_is_run_again(
     call: Call, fresh: Path, plugin: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So is one with a change in a file beside it that it imports, and only such a one."""
-    beside = plugin.parent / "my_helper.py"
+    beside = plugin.parent / "my_folder" / "my_helper.py"  # Python needs no __init__.py there
+    beside.parent.mkdir()
+    (plugin.parent / "torch").mkdir()  # nor does it take a folder of results for a package
     changes = (
         lambda: beside.write_text("BIAS = 0\n"),
         lambda: beside.write_text("BIAS = 1.0\n"),  # of another length, or Python may take the old bytecode for it
@@ -125,7 +127,7 @@ def test_a_changed_plug_in_is_run_again(
         lambda: (plugin.parent / "another.py").write_text("BIAS = 3\n"),
     )
     plugin.write_text(
-        "from my_helper import BIAS\n" + plugin.read_text().replace("torch.zeros(", "BIAS + torch.zeros(")
+        "from my_folder.my_helper import BIAS\n" + plugin.read_text().replace("torch.zeros(", "BIAS + torch.zeros(")
     )
     returns = []
     for change in changes:
@@ -244,6 +246,7 @@ def test_options_reach_the_work(
         (["--architecture", "64-64-64-64"], "use --split seen"),
         (["--split", "unseeen"], "no split named 'unseeen': did you mean unseen"),
         (["--method", "nnit,crop", "--checkpoint", "folder"], "--checkpoint belongs to one --method"),
+        (["--method", "nnit,crop", "--checkpoint", ""], "--checkpoint belongs to one --method"),
         (["--episodes", "0"], "is scored on 1 to"),
         (["--policies", "0"], "--policies must be 1 or more"),
         (["--workers", "0"], "--workers must be 1 or more"),
@@ -285,6 +288,7 @@ def test_what_needs_no_training_takes_no_checkpoint(
     [
         (["--method", "crop"], "crop needs no training; run: nnit-bench run --method crop"),
         (["--preset", "papers"], "no preset of nnit named 'papers'"),
+        (["--seed", "-1"], "--seed must be from 0 to 2147483647, not -1"),
     ],
 )
 def test_a_training_that_cannot_be_is_refused_before_any_work(

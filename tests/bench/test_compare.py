@@ -56,7 +56,7 @@ def test_a_run_against_itself_is_no_different_at_all(store: Store, protocol: Pro
     for each in compare.differ(run, run):
         assert (each.difference.value, each.difference.low, each.difference.high) == (0, 0, 0)
     words = compare.in_words("one", "two", compare.differ(run, run)[0], protocol.metrics[0])
-    assert words == "one and two do the same in every episode: nothing tells them apart in mean success at end."
+    assert words == "one and two have the same mean success at end, and no interval: nothing tells them apart."
 
 
 def test_only_shared_architectures_and_episodes_count(store: Store, protocol: Protocol) -> None:

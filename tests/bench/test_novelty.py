@@ -93,6 +93,13 @@ def test_pairs_and_what_cannot_be_compared(task: Any, zoo: Zoo) -> None:
     assert rows["any_architecture"][0].as_py() > 0.5
 
 
+def test_policies_whose_outputs_overflow_leave_numbers(task: Any, zoo: Zoo) -> None:
+    """A record that holds NaN could not be read again."""
+    layers = tuple(layer * 1e37 for layer in fresh(parse(UNSEEN), 1).layers)
+    found, _ = novelty.measure(task, zoo, [PolicyBatch(parse(UNSEEN), layers), fresh(parse(UNSEEN), 2)])
+    assert found == type(found).model_validate_json(found.model_dump_json())
+
+
 def test_an_architecture_of_another_width_is_compared_where_both_have_weights(task: Any, zoo: Zoo) -> None:
     wide = fresh(parse("96-96-96-96"), 1)
     stored = zoo.batch(SEEN, "seen")[0].to(torch.float32)

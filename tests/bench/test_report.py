@@ -200,6 +200,12 @@ def test_a_missing_run_is_answered_with_its_command(
     command = "nnit-bench train --method nnit --task PushCube-v1, then nnit-bench run --method nnit --task PushCube-v1"
     with pytest.raises(UserError, match=f"{command} --split seen --checkpoint runs/nnit/PushCube-v1$"):
         results.resolve("nnit", found, "PushCube-v1", "seen")
+    with pytest.raises(UserError, match=r"no task named 'PushCub-v1': did you mean PushCube-v1"):
+        results.resolve("crop", found, "PushCub-v1", "seen")
+    with pytest.raises(UserError, match=r"no split named 'unsen': did you mean unseen"):
+        results.resolve("crop", found, "PickCube-v1", "unsen")
+    with pytest.raises(UserError, match=r"no run in results/typo: there is no run\.json"):
+        results.resolve("results/typo", found, "PickCube-v1", "unseen")
     with pytest.raises(UserError, match=r"no stored method named 'nit': did you mean nnit\?; make it with: nnit-bench"):
         results.resolve("nit", found, "PickCube-v1", "unseen")
 

@@ -209,6 +209,9 @@ def test_a_build_does_not_go_on_with_other_settings(builder, tmp_path):
     with pytest.raises(UserError, match="made with other settings"):
         builder(tmp_path, "MNIST-PCA32").ghns()
     (tmp_path / "work" / "ghns" / "made.json").unlink()
+    (tmp_path / "work" / "twins").mkdir()
+    (tmp_path / "work" / "twins" / ".made.json.0123").touch()  # left by a kill, and no reason to stop
+    builder(tmp_path, "MNIST-PCA32")._sign("twins", {}, works=False)
     with pytest.raises(UserError, match=r"no made\.json that says how its files were made"):
         builder(tmp_path, "MNIST-PCA32").ghns()
 
@@ -224,6 +227,10 @@ def test_nothing_is_built_on_another_expert(builder, tmp_path):
         other.expert()
     shutil.rmtree(tmp_path / "work" / "expert")
     (data_folder("PickCube-v1") / stats.TWINS).touch()
+    (data_folder("PickCube-v1") / "manifest.json").touch()
+    with pytest.raises(UserError, match=r"made by another expert; .* move elsewhere, from there, .*manifest\.json"):
+        other.expert()
+    (data_folder("PickCube-v1") / "manifest.json").unlink()
     other.expert()
     assert not (data_folder("PickCube-v1") / stats.TWINS).exists()  # they were the old one's students
     with pytest.raises(UserError, match="states was made with other settings"):

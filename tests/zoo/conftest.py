@@ -71,7 +71,7 @@ def zoo_folder(data_folder: Path, tmp_path: Path) -> Path:
 def home(data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache of its own, and the tiny zoo as the only one that ships."""
     monkeypatch.setattr(places, "DATA", data_folder.parent)
-    monkeypatch.setattr(places, "cached_assets_path", (tmp_path / "home").joinpath)
+    monkeypatch.setattr(places, "CACHE", tmp_path / "home" / "nnit" / "zoo")
     return tmp_path / "home"
 
 

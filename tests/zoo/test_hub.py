@@ -6,13 +6,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import huggingface_hub
 import pytest
 
 from nnit_zoo import card, files
 from nnit_zoo.errors import UserError
-from nnit_zoo.hub import Source, push
+from nnit_zoo.hub import Source, Target
 from nnit_zoo.verify import verify
 from nnit_zoo.zoo import Zoo
 
@@ -129,7 +130,7 @@ def test_no_connection_is_an_answer(made_once: Path, monkeypatch: pytest.MonkeyP
 
 def test_what_is_pushed_can_be_downloaded(hub, made_once: Path, tmp_path: Path) -> None:
     card.write_dataset(tmp_path / "set", [Zoo.open(made_once)], "someone/new")
-    assert hub.address in push("someone/new", tmp_path / "set")
+    assert hub.address in Target("someone/new", ["PickCube-v1"]).push(tmp_path / "set")
     assert "someone/new" in hub.files["someone/new"]["README.md"].decode()
     large = {path.read_bytes() for path in (tmp_path / "set").rglob("*") if path.suffix in (".safetensors", ".parquet")}
     assert set(hub.objects.values()) == large
@@ -137,18 +138,43 @@ def test_what_is_pushed_can_be_downloaded(hub, made_once: Path, tmp_path: Path) 
     assert contents(tmp_path / "zoo") == contents(made_once)
 
 
+def test_a_push_takes_away_what_a_task_had_else_and_nothing_more(hub, made_once: Path, tmp_path: Path) -> None:
+    card.write_dataset(tmp_path / "set", [Zoo.open(made_once)], "someone/new")
+    kept = {"notes.md": b"mine", "figures/one.png": b"mine"}
+    hub.files["someone/new"] = {"PickCube-v1/build/ghns.safetensors": b"of another zoo", **kept}
+    Target("someone/new", ["PickCube-v1"]).push(tmp_path / "set")
+    paths = {str(path.relative_to(tmp_path / "set")) for path in (tmp_path / "set").rglob("*") if path.is_file()}
+    assert set(hub.files["someone/new"]) == {*paths, *kept}
+
+
 def test_a_push_does_not_take_other_zoos_off_the_card(hub, made_once: Path, tmp_path: Path) -> None:
     card.write_dataset(tmp_path / "set", [Zoo.open(made_once)], "someone/new")
-    push("someone/new", tmp_path / "set")
-    (tmp_path / "set" / "PickCube-v1").rename(tmp_path / "set" / "PushCube-v1")
+    Target("someone/new", ["PickCube-v1"]).push(tmp_path / "set")
     with pytest.raises(UserError, match="someone/new also holds PickCube-v1: name all of its tasks"):
-        push("someone/new", tmp_path / "set")
+        Target("someone/new", ["PushCube-v1"])
 
 
-def test_a_refused_push_says_how_to_log_in(hub, tmp_path: Path) -> None:
+def test_a_refused_push_says_how_to_log_in(hub) -> None:
     hub.closed = True
     with pytest.raises(UserError, match=r"(?s)refuses someone/new.*hf auth login"):
-        push("someone/new", tmp_path)
+        Target("someone/new", ["PickCube-v1"])
+
+
+def test_a_push_to_nobody_makes_nothing(hub) -> None:
+    with pytest.raises(UserError, match="'new' names no data set; write owner/name"):
+        Target("new", ["PickCube-v1"])
+    assert set(hub.files) == {"someone/zoo"}
+
+
+@pytest.mark.parametrize("error", [ConnectionError, TimeoutError, RuntimeError])
+def test_a_push_that_is_cut_off_by_xet_is_answered(
+    hub, error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Xet's own client raises these, without a word of who was asked."""
+    target = Target("someone/new", [])
+    monkeypatch.setattr(huggingface_hub.HfApi, "create_commit", Mock(side_effect=error("gone")))
+    with pytest.raises(UserError, match=r"connection to someone/new failed \(gone\); run the same command again"):
+        target.push(tmp_path)
 
 
 def test_the_command_with_its_environment(hub, made_once: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
@@ -93,7 +94,9 @@ class Trainer:
         """What must agree between a state and a training that goes on from it."""
         policies = [len(packed.patches) for packed in self.data]
         total = float(sum(packed.patches.double().sum() for packed in self.data))
-        return f"{self.settings.model_dump_json()} seed {self.seed} policies {policies} sum {total:.6f}"
+        code = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+        settings = self.settings.model_dump_json()
+        return f"{settings} seed {self.seed} policies {policies} sum {total:.6f} code {code.hexdigest()}"
 
     def save(self, path: Path) -> None:
         """Write the state, atomically."""
@@ -112,7 +115,7 @@ class Trainer:
             raise UserError(f"{path} is damaged, or no state of a training; delete it to start anew") from None
         if identity != self.identity():
             raise UserError(
-                f"{path} is the state of a training with other settings, seed or data; "
+                f"{path} is the state of a training with other settings, seed or data, or by other code of NNiT; "
                 "repeat those, or delete the file to start anew"
             )
         for name in ("model", "optimiser", "mean"):
