@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import pytest
-import torch
 from safetensors.torch import load_file
 
 from nnit_baselines import SampleRequest, registry
@@ -57,7 +56,7 @@ def test_there_are_checkpoints_and_results() -> None:
 def test_a_checkpoint_is_small_samples_and_is_of_the_zoo_that_ships(folder: Path) -> None:
     generator = registry.get(folder.parent.name).from_pretrained(folder, folder.name)
     assert generator.training_facts["zoo_manifest_sha256"] == manifest_of(folder.name)
-    assert {tensor.dtype for tensor in load_file(folder / WEIGHTS).values()} == {torch.float16}
+    assert max(tensor.element_size() for tensor in load_file(folder / WEIGHTS).values()) <= 2
     generator.sampling_steps = 2
     task = tasks.get(folder.name)
     wanted = architectures("unseen", task.inputs, task.outputs)[0]

@@ -15,6 +15,7 @@ from nnit_baselines.nnit.config import NNiTConfig, preset, preset_name
 from nnit_baselines.nnit.form import Form
 from nnit_baselines.nnit.mixture import Mixture, Packed, PackedMixture, PaddedMixture
 from nnit_baselines.nnit.model import Transformer
+from nnit_baselines.quantise import quantised, restored
 from nnit_zoo.architecture import Architecture
 from nnit_zoo.errors import UserError
 from nnit_zoo.policy import PolicyBatch
@@ -87,8 +88,8 @@ class NNiT(Generator):
         return {"form": asdict(self.form), "settings": self.settings.model_dump()}
 
     def tensors(self) -> dict[str, Tensor]:
-        """The transformer's parameters in float16."""
-        return {name: tensor.half().cpu().contiguous() for name, tensor in self.model.state_dict().items()}
+        """The transformer's parameters, quantised."""
+        return quantised({name: tensor.cpu() for name, tensor in self.model.state_dict().items()})
 
     @classmethod
     def from_state(cls, config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
@@ -125,7 +126,7 @@ class NNiT(Generator):
 
     def _restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Take stored parameters; a model just fitted does so too, to be the same as one read from its checkpoint."""
-        self.model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+        self.model.load_state_dict(restored(tensors))
         self.model.eval()
 
     def _policies(self, tokens: Tensor, architecture: Architecture) -> PolicyBatch:
