@@ -33,6 +33,7 @@ class NNiT(Generator):
         self.settings = settings or NNiTConfig()
         self.form: Form
         self.model: Transformer
+        self.stored: dict[str, Tensor]
 
     @property
     def description(self) -> str:
@@ -65,7 +66,7 @@ class NNiT(Generator):
         facts = training.train(self.model, data, self.mixture, options)
         settings = preset_name(self.settings)
         self.training_facts = {**({"preset": settings} if settings else {}), **facts}
-        self._restore(self.tensors())
+        self._restore(quantised({name: tensor.cpu() for name, tensor in self.model.state_dict().items()}))
 
     def sample(self, request: SampleRequest) -> PolicyBatch:
         """Networks of the requested architecture; raises UserError if its form or widths are not those learned."""
@@ -88,8 +89,8 @@ class NNiT(Generator):
         return {"form": asdict(self.form), "settings": self.settings.model_dump()}
 
     def tensors(self) -> dict[str, Tensor]:
-        """The transformer's parameters, quantised."""
-        return quantised({name: tensor.cpu() for name, tensor in self.model.state_dict().items()})
+        """The transformer's parameters as its checkpoint has them: quantised, or all in float16."""
+        return self.stored
 
     @classmethod
     def from_state(cls, config: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
@@ -126,6 +127,7 @@ class NNiT(Generator):
 
     def _restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Take stored parameters; a model just fitted does so too, to be the same as one read from its checkpoint."""
+        self.stored = dict(tensors)
         self.model.load_state_dict(restored(tensors))
         self.model.eval()
 
