@@ -15,9 +15,11 @@ Fewer than five drawn units say too little of how units differ: there is no inte
 
 Units may also be *given* instead of drawn, such as ten policies that were picked: then only episodes vary.
 
-If every episode went the same way there is nothing to resample; the open end of the interval is then Clopper and
-Pearson's exact bound for as many trials as there are episodes. A table of one column, such as of means over episodes,
-says nothing of episodes: its interval is about units, and they are the trials.
+Resampling knows only the kinds of episode that were drawn. A start that all fail, or all master, can be missed by all
+draws: one of share 1 - 0.025^(1 / episodes) is with a probability of 2.5 %. So the interval of a mean of successes
+reaches as far as the mean would move if one such start in so many had been missed. If every episode went the same way,
+this is Clopper and Pearson's exact interval. A table of one column, such as of means over episodes, says nothing of
+episodes: its interval is about units, and if they are all alike, they are the trials.
 """
 
 from __future__ import annotations
@@ -65,8 +67,16 @@ def mean(
     drawn: bool = True,
     bounds: tuple[float, float] | None = None,
 ) -> Estimate:
-    """The mean of values [policies, episodes] and its interval; `clusters` [policies] says which are drawn together."""
-    return estimate([by_cluster(values, clusters)], rng, drawn=drawn, bounds=bounds)
+    """The mean of values [policies, episodes] and its interval; `clusters` [policies] says which are drawn together.
+
+    `bounds` are the least and the largest value that there is; if there are no others, the values are successes.
+    """
+    found = estimate([by_cluster(values, clusters)], rng, drawn=drawn, bounds=bounds)
+    episodes = values.shape[1]
+    if bounds is None or episodes == 1 or found.low == found.high or not np.isin(values, bounds).all():
+        return found
+    low, high = _missed(found.value, episodes, bounds)
+    return Estimate(found.value, min(low, found.low), max(high, found.high))
 
 
 def by_cluster(values: Floats, clusters: NDArray[np.generic] | None) -> Floats:
@@ -109,7 +119,7 @@ def estimate(
         low, high = value - above * variance**0.5, value - below * variance**0.5
     else:
         trials = episodes if episodes > 1 else min(map(len, tables))
-        low, high = _exact(value, trials, bounds) if bounds else (value, value)
+        low, high = _missed(value, trials, bounds) if bounds and np.isclose(value, bounds).any() else (value, value)
     if bounds:
         low, high = max(low, bounds[0]), min(high, bounds[1])
     return Estimate(value, low, high)
@@ -150,12 +160,7 @@ def _moments(tables: Sequence[Floats], of_units: Sequence[Floats], of_episodes: 
     return total, variance
 
 
-def _exact(value: float, trials: int, bounds: tuple[float, float]) -> tuple[float, float]:
-    """Clopper and Pearson's interval if all of `trials` gave the least or the largest value there is."""
-    least, largest = bounds
-    reach = (largest - least) * (1 - TAILS[0] ** (1 / trials))
-    if np.isclose(value, largest):
-        return largest - reach, largest
-    if np.isclose(value, least):
-        return least, least + reach
-    return value, value
+def _missed(value: float, trials: int, bounds: tuple[float, float]) -> tuple[float, float]:
+    """How far `value` would move if the largest share that `trials` may have missed were all at one of the bounds."""
+    share = 1 - TAILS[0] ** (1 / trials)
+    return value - share * (value - bounds[0]), value + share * (bounds[1] - value)

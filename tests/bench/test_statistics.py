@@ -51,20 +51,29 @@ def test_variance_is_that_of_the_two_way_layout() -> None:
 
 
 @pytest.mark.parametrize(
-    ("architecture", "policy", "episode", "level", "least"),
+    ("architecture", "policy", "episode", "level", "least", "most"),
     [
-        pytest.param(0, 1, 0.3, 1, 0.93, id="policies differ"),
-        pytest.param(0.5, 1, 0.3, 1, 0.93, id="both differ"),
-        pytest.param(0, 0.3, 1, 1, 0.93, id="hard and easy episodes"),
-        pytest.param(1, 0.5, 0.3, 1, 0.93, id="architectures differ"),
-        pytest.param(0, 0, 0, 1, 0.93, id="all alike"),
-        pytest.param(0.3, 0.5, 0.5, 2.5, 0.92, id="98 % succeed"),
+        pytest.param(0, 1, 0.3, 1, 0.93, 0.97, id="policies differ"),
+        pytest.param(0.5, 1, 0.3, 1, 0.93, 0.97, id="both differ"),
+        pytest.param(0, 0.3, 1, 1, 0.93, 0.97, id="hard and easy episodes"),
+        pytest.param(1, 0.5, 0.3, 1, 0.93, 0.97, id="architectures differ"),
+        pytest.param(0, 0, 0, 1, 0.93, 1, id="all alike"),
+        pytest.param(0.3, 0.5, 0.5, 2.5, 0.92, 1, id="98 % succeed"),
     ],
 )
 def test_interval_holds_the_truth(
-    architecture: float, policy: float, episode: float, level: float, least: float, monkeypatch: pytest.MonkeyPatch
+    architecture: float,
+    policy: float,
+    episode: float,
+    level: float,
+    least: float,
+    most: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Coverage of 95 % intervals on successes of 8 architectures x 10 policies x 50 shared episodes."""
+    """Coverage of 95 % intervals on successes of 8 architectures x 10 policies x 50 shared episodes.
+
+    Where little differs, the room for starts that nobody drew makes it more than 95 %.
+    """
     monkeypatch.setattr(statistics, "REPLICATES", 500)
     rng = np.random.default_rng(0)
     truth = scipy.stats.norm.cdf(level / np.sqrt(1 + architecture**2 + policy**2 + episode**2))
@@ -75,7 +84,37 @@ def test_interval_holds_the_truth(
         success = level + skill[:, None] + rng.normal(0, episode, 50) + rng.normal(size=(80, 50)) > 0
         interval = mean(success.astype(float), clusters, rng, bounds=(0, 1))
         held += interval.low <= truth <= interval.high
-    assert least <= held / runs <= 0.97
+    assert least <= held / runs <= most
+
+
+@pytest.mark.parametrize("share", [0.01, 0.02, 0.04, 0.08])
+def test_interval_allows_for_starts_that_all_policies_fail(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such starts may be too rare to be drawn, and yet decide by how much nearly perfect policies miss perfection."""
+    monkeypatch.setattr(statistics, "REPLICATES", 300)
+    rng = np.random.default_rng(0)
+    held, runs = 0, 300
+    for _ in range(runs):
+        rate = np.where(rng.random(50) < share, 0.04, 0.998)
+        success = (rng.random((80, 50)) < rate).astype(float)
+        interval = mean(success, np.repeat(np.arange(8), 10), rng, bounds=(0, 1))
+        held += interval.low <= share * 0.04 + (1 - share) * 0.998 <= interval.high
+    assert held / runs >= 0.94
+
+
+def test_a_stray_failure_does_not_make_a_score_surer() -> None:
+    perfect = np.ones((80, 50))
+    stray = perfect.copy()
+    stray[7, 7] = 0
+    clusters = np.repeat(np.arange(8), 10)
+    first, second = (mean(table, clusters, np.random.default_rng(0), bounds=(0, 1)) for table in (perfect, stray))
+    assert second.low < first.low and second.high <= 1
+
+
+def test_shares_of_many_digits_have_no_room_for_missed_blocks() -> None:
+    """100 blocks of 100 test digits each: no block is all right or all wrong."""
+    values = np.random.default_rng(0).binomial(100, 0.97, (80, 100)) / 100
+    ours = mean(values, np.repeat(np.arange(8), 10), np.random.default_rng(0), bounds=(0, 1))
+    assert ours.high - ours.low < 0.01
 
 
 def test_paired_difference_holds_the_truth_and_is_narrower_than_an_unpaired_one(
