@@ -24,7 +24,7 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.places import data_folder
 from nnit_zoo.summary import by_split
 from nnit_zoo.tasks.mnist import FEATURES
-from nnit_zoo.zoo import Zoo, damaged
+from nnit_zoo.zoo import Zoo
 
 DESCRIPTION = (
     "Small Tanh networks that solve a task each, made by hypernetworks, to train and compare generators of weights on."
@@ -64,7 +64,8 @@ README = """# {title}
 {table}
 
 *Seen* policies, of training seeds, are the corpus. *Unseen* and *excluded* architectures and the policies of *held-out
-seeds* are yardsticks: no generator should learn from them.
+seeds* are yardsticks: no generator should learn from them. Splits that played different numbers of episodes did not
+meet the same starts, so small differences of their scores mean nothing.
 
 ## Use it
 
@@ -126,11 +127,13 @@ def readme(indexes: Sequence[tuple[files.Manifest, pa.Table]], repository: str =
     header = DatasetCardData(
         license="cc-by-4.0", pretty_name="NNiT policy zoo", tags=["model-zoo", "weight-generation"], configs=configs
     )
-    lines = ["| Task | Split | Architectures | Policies | Success at end | Return |", "|---|---|---|---|---|---|"]
+    names = ("Task", "Split", "Architectures", "Policies", "Episodes of each", "Success at end", "Return")
+    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     for manifest, index in indexes:
         for split, row in by_split(index).items():
             success = "" if row["success_at_end"] is None else f"{row['success_at_end']:.1%}"
-            numbers = f"{row['architectures']} | {row['policies']:,} | {success} | {row['return']:.3g}"
+            counts = f"{row['architectures']} | {row['policies']:,} | {row['episodes']}"
+            numbers = f"{counts} | {success} | {row['return']:.3g}"
             lines.append(f"| {manifest.task} | {split} | {numbers} |")
     first = indexes[0][0]
     text = README.format(
@@ -156,8 +159,7 @@ def write_dataset(folder: Path, zoos: Sequence[Zoo], repository: str = HERE) -> 
         raise UserError(f"{folder} holds the data set of {', '.join(lost)}; choose another folder")
     for zoo in zoos:
         place = folder / zoo.task
-        for name in zoo.manifest.missing(zoo.folder, zoo.manifest.files):
-            raise damaged(zoo.folder / name, zoo.task)
+        zoo.check_whole()
         for name in (*zoo.manifest.files, files.MANIFEST):
             write_atomically(place / name, partial(shutil.copyfile, zoo.folder / name))
         record, data = tasks.get(zoo.task).record, data_folder(zoo.task)

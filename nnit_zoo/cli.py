@@ -80,7 +80,9 @@ def show(task: str = "PickCube-v1", *, architecture: str | None = None, as_json:
             print_json(zoo)
             return
         rows = [{"split": split, **row} for split, row in zoo["splits"].items()]
-        print_rows(rows, ("split", "architectures", "policies", *files.SCORES))
+        print_rows(rows, ("split", "architectures", "policies", "episodes", *files.SCORES))
+        if len({row["episodes"] for row in rows}) > 1:
+            sys.stdout.write("Means of different numbers of episodes are of different starts, so not to be compared.\n")
         rates = zoo["pass_rates"]
         least = min(rates, key=rates.__getitem__)
         mean = sum(rates.values()) / len(rates)
@@ -115,7 +117,8 @@ def download(
     Args:
         task: Name of the task.
         split: Only the shards with policies of these splits; repeat the option or use commas.
-        source: A data set of the Hub (owner/name or hf://datasets/owner/name), or a folder.
+        source: A data set of the Hub (owner/name or hf://datasets/owner/name), or a folder. With HF_HUB_OFFLINE, a
+            data set is not asked, and the zoo is made, with the same bytes.
         revision: Branch, tag or commit of the data set.
         folder: Where to write, instead of the cache of huggingface_hub.
         dry_run: Only say what would be written.
@@ -249,13 +252,15 @@ def export(policy: str, output: Path, *, folder: Path | None = None, as_json: Js
         folder: Where the zoo is, if not in the cache of huggingface_hub.
         as_json: Print JSON.
     """
+    from nnit_zoo import export as formats
     from nnit_zoo.zoo import load
 
-    zoo = load(policy.partition("/")[0], folder)
-    if "/" in policy:
-        from nnit_zoo.export import export as write
-
-        write(zoo, policy, output)
+    task, *within = policy.split("/")
+    if not within and output.suffix in formats.WRITERS:
+        raise UserError(f"{policy} is a whole zoo, which becomes a folder; {output.suffix} is for one policy")
+    zoo = load(task, folder)
+    if within:
+        formats.export(zoo, policy, output)
     else:
         from nnit_zoo.card import write_dataset
 
@@ -293,17 +298,20 @@ def push(repository: str, *, task: Names = (), folder: Path | None = None, as_js
 
     Args:
         repository: owner/name of the data set.
-        task: Only these tasks; repeat the option or use commas.
+        task: Only these tasks, by default all, or that of the folder; repeat the option or use commas.
         folder: Where the zoo is, if not in the cache of huggingface_hub.
         as_json: Print JSON.
     """
     from tempfile import TemporaryDirectory
 
-    from nnit_zoo import hub, places
+    from nnit_zoo import files, hub, places
     from nnit_zoo.card import write_dataset
     from nnit_zoo.zoo import load
 
-    zoos = {name: load(name, folder) for name in task or places.tasks_with_zoo()}
+    there = places.tasks_with_zoo() if folder is None else (files.Manifest.read(folder).task,)
+    zoos = {name: load(name, folder) for name in task or there}
+    for zoo in zoos.values():
+        zoo.check_whole()
     target = hub.Target(repository, zoos)  # what cannot be is told before the work
     with TemporaryDirectory() as place:
         write_dataset(Path(place), list(zoos.values()), repository)

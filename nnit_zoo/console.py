@@ -45,13 +45,15 @@ def _text(value: Any) -> str:
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table."""
-    from rich.box import SIMPLE  # noqa: PLC0415
+    from rich.box import SIMPLE_HEAD  # noqa: PLC0415
     from rich.console import Console  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
-    table = Table(box=SIMPLE)
-    for column in columns:
-        table.add_column(column, overflow="fold")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    for number, column in enumerate(columns):
+        texts = [column, *(row[number] for row in rows)]
+        short = all(len(text) <= 20 and " " not in text for text in texts)  # on a narrow screen, others break first
+        table.add_column(column, overflow="fold", no_wrap=short)
     for row in rows:
         table.add_row(*row)
     Console().print(table)

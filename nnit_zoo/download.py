@@ -10,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 
 import pyarrow as pa
+from huggingface_hub import is_offline_mode
 
 from nnit_zoo import files, places
 from nnit_zoo.display import Display
@@ -20,8 +21,9 @@ from nnit_zoo.files import INDEX, MANIFEST, SPLITS, Entry, Progress
 class Download:
     """A zoo and the folder that it goes to, by default the task's usual one; nothing is written before `run`.
 
-    `source` is an address as of `nnit_zoo.hub.Source`; without one, the zoo is made from the GHNs that ship. Raises
-    UserError if there is no such zoo, or if a source's would take the place of this version's.
+    `source` is an address as of `nnit_zoo.hub.Source`; without one, the zoo is made from the GHNs that ship. So it is
+    if the Hub is not to be asked: in the usual folder, both give the same bytes. Raises UserError if there is no such
+    zoo, or if a source's would take the place of this version's.
     """
 
     def __init__(
@@ -34,6 +36,8 @@ class Download:
             held = files.Manifest.read(self.folder).task
         if held != task:
             raise UserError(f"{self.folder} holds the zoo of {held}; choose another folder for that of {task}")
+        if source and not revision and folder is None and is_offline_mode() and not Path(source).is_dir():
+            source = None
         self._verb = "fetching" if source else "making"
         self._index: pa.Table
         self._bring: Callable[[Path, Progress, Collection[str]], None]

@@ -155,7 +155,9 @@ def fill(
 
 
 def _write(path: Path, content: bytes, needed: int) -> None:
-    """Write a file of a zoo, with advice if that fails; `needed` is what remains to be written, in bytes."""
+    """Write a file of a zoo unless it is there, with advice if that fails; `needed` bytes are still to be written."""
+    if Entry.of(content).describes(path):
+        return
     try:
         write_bytes(path, content)
     except OSError as error:
@@ -185,6 +187,12 @@ def sha256_of(path: Path) -> str:
 
 
 def read_index(path: Path | io.BytesIO, architecture: str | None = None) -> pa.Table:
-    """The rows of an index file, of one architecture if given; columns as in INDEX_SCHEMA."""
-    table = pq.ParquetFile(path).read()
+    """The rows of an index file, of one architecture if given; raises UserError if its columns are not INDEX_SCHEMA."""
+    name = path if isinstance(path, Path) else INDEX
+    try:
+        table = pq.ParquetFile(path).read()
+    except pa.ArrowException:
+        raise UserError(f"{name} is not a Parquet file, so no index of a zoo") from None
+    if not table.schema.equals(INDEX_SCHEMA):
+        raise UserError(f"{name} has other columns than {', '.join(INDEX_SCHEMA.names)}")
     return table if architecture is None else table.filter(pc.equal(table["architecture"], architecture))

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import httpx2
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, HfFileSystem
+from huggingface_hub.constants import ENDPOINT
 from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalTokenNotFoundError, OfflineModeIsEnabled
 from pydantic import ValidationError
 
@@ -21,12 +22,15 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.files import INDEX, MANIFEST, Entry, Manifest, Progress
 
 _CONNECTIONS = 8
+_PREFIXES = (f"{ENDPOINT}/datasets/", "hf://datasets/", "hf://", "datasets/")
+"""What may precede owner/name in the address of a data set."""
 
 
 class Source:
-    """The zoo of a task at an address: a folder, `owner/name` of a data set of the Hub, or `hf://datasets/owner/name`.
+    """The zoo of a task at an address: a folder, or a data set of the Hub.
 
-    `revision` is a branch, tag or commit of the data set. Raises UserError if there is no such place or no zoo in it.
+    A data set is `owner/name`, `hf://datasets/owner/name`, or the address of its page. `revision` is a branch, tag or
+    commit of it. Raises UserError if there is no such place or no zoo in it.
     """
 
     def __init__(self, address: str, task: str, revision: str | None = None) -> None:
@@ -41,7 +45,8 @@ class Source:
             raise UserError(f"no folder {address}")
         else:
             self._hub = HfFileSystem(skip_instance_cache=True)  # what the Hub holds may change
-            root = address.removeprefix("hf://") if address.startswith("hf://") else f"datasets/{address}"
+            prefix = next(filter(address.startswith, _PREFIXES), "")
+            root = f"datasets/{address.removeprefix(prefix).rstrip('/')}"
         self._folder = f"{root}/{task}"
         with explained(self.address):
             try:
@@ -144,6 +149,8 @@ def explained(address: str) -> Iterator[None]:
     except (FileNotFoundError, EntryNotFoundError, NotImplementedError, ValueError) as error:
         raise UserError(f"nothing of that kind in {address}: {error}") from None
     except HfHubHTTPError as error:
-        raise UserError(f"the Hub refuses {address}: {error}; log in with: hf auth login") from None
+        if error.response.status_code in (401, 403, 404):  # what is private seems not to be there
+            raise UserError(f"the Hub refuses {address}: {error}; check the name, or hf auth login") from None
+        raise UserError(f"the Hub cannot serve {address} now: {error}; run the same command again") from None
     except (httpx2.HTTPError, ConnectionError, TimeoutError, RuntimeError) as error:  # the last three from Xet
         raise UserError(f"the connection to {address} failed ({error}); run the same command again") from None

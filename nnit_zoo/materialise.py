@@ -42,9 +42,13 @@ def materialise(
 ) -> None:
     """Write the shards of these splits of the zoo in a task's data folder to `target`, as `files.fill` does.
 
-    Shards that are there already are kept. Raises UserError if a shard comes out different from the manifest.
+    Shards that are there already are kept. Raises UserError if the index is not the manifest's, or a shard comes out
+    different from it.
     """
     manifest = Manifest.read(data_folder)
+    index = (data_folder / files.INDEX).read_bytes()
+    if Entry.of(index) != manifest.index:
+        raise UserError(f"{data_folder / files.INDEX} is not what {files.MANIFEST} promises; install nnit again")
 
     def make(names: Collection[str]) -> Iterator[tuple[str, bytes]]:
         source = _Source(data_folder)
@@ -60,7 +64,7 @@ def materialise(
     files.fill(
         target,
         manifest,
-        (data_folder / files.INDEX).read_bytes(),
+        index,
         make,
         splits=splits,
         progress=progress,

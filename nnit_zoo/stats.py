@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -168,16 +168,25 @@ def draw(zoo: Zoo, chosen: Sequence[Architecture], folder: Path) -> Iterator[Pat
 
     batches = [zoo.batch(architecture, "seen") for architecture in chosen]
     pictures = (
-        ("magnitudes", "mean |W| of each input neuron", _magnitudes),
-        ("pairs", "all pairs of an architecture's policies", _pairs),
+        ("magnitudes", "mean |W| of each input neuron", (CORRELATION,), _magnitudes),
+        ("pairs", "all pairs of an architecture's policies", (NEAREST_L2, NEAREST_COSINE), _pairs),
     )
-    for name, title, picture in pictures:
+    here = [alignment(batch) for batch in batches]
+    for name, title, measures, picture in pictures:
         figure = Figure(layout="constrained", dpi=150)
         picture(figure, batches)
-        figure.suptitle(f"{zoo.task}: {title}")
+        lines = (_beside_paper(zoo.task, each, here) for each in measures)
+        figure.suptitle("\n".join([f"{zoo.task}: {title}", *lines]), fontsize="medium")
         path = folder / f"{name}.png"
         write_atomically(path, partial(figure.savefig, format="png"))
         yield path
+
+
+def _beside_paper(task: str, measure: str, here: Sequence[Mapping[str, float]]) -> str:
+    """A measure of the architectures shown, and the paper's, in words."""
+    values = ", ".join(f"{each[measure]:.2f}" for each in here)
+    paper = PAPER.get(task, {}).get(measure)
+    return f"{measure}: {values}; NNiT: {'not given' if paper is None else f'{paper:g}'}"
 
 
 def _magnitudes(figure: Any, batches: Sequence[PolicyBatch]) -> None:

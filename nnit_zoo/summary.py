@@ -14,13 +14,18 @@ from nnit_zoo.files import HELDOUT_SEEDS_FROM, MANIFEST, SCORES, SELECTION, SPLI
 
 
 def by_split(index: pa.Table) -> dict[str, dict[str, Any]]:
-    """Per split its numbers of architectures and policies and the mean scores of these, None where a task has none."""
-    counts = [("architecture", "count_distinct"), ("id", "count"), *((score, "mean") for score in SCORES)]
+    """Per split its numbers of architectures and policies and the mean scores of these, None where a task has none.
+
+    `episodes` are those that each policy played: all splits with as many played the same ones.
+    """
+    counts = [("architecture", "count_distinct"), ("id", "count"), ("episodes", "min")]
+    counts += [(score, "mean") for score in SCORES]
     rows = index.group_by("split", use_threads=False).aggregate(counts).to_pylist()
     return {
         row["split"]: {
             "architectures": row["architecture_count_distinct"],
             "policies": row["id_count"],
+            "episodes": row["episodes_min"],
             **{score: row[f"{score}_mean"] for score in SCORES},
         }
         for row in sorted(rows, key=lambda row: SPLITS.index(row["split"]))

@@ -28,9 +28,10 @@ def verify(folder: Path, progress: Progress | None = None, splits: Collection[st
     manifest = files.Manifest.read(folder)
     if not manifest.index.describes(folder / files.INDEX):
         return [str(damaged(folder / files.INDEX, manifest.task))]
-    index = files.read_index(folder / files.INDEX)
-    if not index.schema.equals(files.INDEX_SCHEMA):
-        return [f"{folder / files.INDEX} has other columns than {', '.join(files.INDEX_SCHEMA.names)}"]
+    try:
+        index = files.read_index(folder / files.INDEX)
+    except UserError as error:
+        return [str(error)]
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in manifest.shards}
     problems = []
     for row in index.to_pylist():

@@ -78,6 +78,11 @@ class Zoo:
             )
         return cls(folder, manifest, files.read_index(folder / files.INDEX))
 
+    def check_whole(self) -> None:
+        """Raise UserError unless all files of the zoo are there and as its manifest promises."""
+        for name in self.manifest.missing(self.folder, self.manifest.files):
+            raise damaged(self.folder / name, self.task)
+
     @property
     def task(self) -> str:
         """Name of the task that the policies solve."""

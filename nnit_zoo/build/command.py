@@ -16,6 +16,7 @@ from nnit_zoo import tasks
 from nnit_zoo.build.builder import ZOO, Builder
 from nnit_zoo.build.mnist import MNISTBuilder
 from nnit_zoo.build.robot import RobotBuilder
+from nnit_zoo.console import Json, print_json
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import SELECTION
 from nnit_zoo.parallel import Backend
@@ -37,6 +38,7 @@ def build(
     parallel: Backend = "processes",
     work: Path = Path("runs/build"),
     source: str | None = None,
+    as_json: Json = False,
 ) -> None:
     """Build a task's zoo: what its GHNs learn from, one GHN per seed, every candidate's scores, and those that pass.
 
@@ -48,6 +50,7 @@ def build(
         parallel: Where candidates are scored: on this machine, or on a Ray cluster.
         work: Folder of intermediate states; a killed build resumes from it.
         source: MNIST-PCA32's digits: a folder with the original IDX files, or ylecun/mnist.
+        as_json: At the end, print as JSON what was built.
     """
     torch.set_num_threads(1)
     chosen = tasks.get(task)
@@ -73,5 +76,10 @@ def build(
     known = (*builder.stages, *builder.analyses)
     if stage not in ("all", *known):
         raise UserError(f"building {task} has no stage '{stage}': there are {', '.join(known)}")
-    for name in builder.stages if stage == "all" else (stage,):
+    stages = builder.stages if stage == "all" else (stage,)
+    for name in stages:
         getattr(builder, name)()
+    if as_json:
+        print_json(
+            {"task": task, "stages": stages, "seeds": seeds, "work": str(builder.work), "folder": str(builder.data)}
+        )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,6 +38,15 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "x", fail)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+
+
+def test_what_went_wrong_is_told_even_if_nothing_can_be_cleared_up(tmp_path, monkeypatch):
+    def fail(path, **_):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "unlink", fail)
+    with pytest.raises(OSError, match=f"Read-only.*{tmp_path / 'x'}"):
+        write_atomically(tmp_path / "x", fail)
 
 
 @pytest.fixture

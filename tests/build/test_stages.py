@@ -156,6 +156,17 @@ def test_a_build_that_cannot_be_says_why(options, message, monkeypatch, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_a_build_says_as_json_what_it_made(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(mnist.MNISTBuilder, "features", lambda self: None)
+    monkeypatch.chdir(tmp_path)
+    options = ["--task", "MNIST-PCA32", "--stage", "features", "--seeds", "144", "--json"]
+    monkeypatch.setattr(sys, "argv", ["nnit-zoo", "build", *options])
+    main()
+    made = json.loads(capsys.readouterr().out)
+    assert (made["stages"], made["seeds"], made["work"]) == (["features"], 144, "runs/build/MNIST-PCA32")
+    assert made["folder"] == str(data_folder("MNIST-PCA32"))
+
+
 def test_a_stage_without_the_one_before_says_which_to_run(builder, tmp_path):
     with pytest.raises(UserError, match="stage 'expert' first"):
         builder(tmp_path).states()

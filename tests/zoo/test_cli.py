@@ -107,6 +107,21 @@ def test_list_and_show_need_no_download(nnit_zoo: Command, home: Path) -> None:
     assert [policy["id"] for policy in policies] == ["PickCube-v1/64-64-64-32/000", "PickCube-v1/64-64-64-32/128"]
 
 
+def test_scores_of_other_episodes_are_not_to_be_compared(nnit_zoo: Command) -> None:
+    splits = json.loads(nnit_zoo("show", "--json")[1])["splits"]
+    assert {split: row["episodes"] for split, row in splits.items()} == {
+        "seen": 64, "unseen": 64, "excluded": 64, "heldout_seed": 16
+    }  # fmt: skip
+    assert "Means of different numbers of episodes are of different starts" in nnit_zoo("show")[1]
+
+
+def test_a_table_fits_a_narrow_screen(nnit_zoo: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = nnit_zoo("show")[1].splitlines()
+    assert "architectures" in lines[1] and "heldout_seed" in lines[-1] + "".join(lines[:9])
+    assert max(len(line) for line in lines[:7]) <= 80 and "return" in lines[1]
+
+
 def test_download_then_verify_then_mend(nnit_zoo: Command, home: Path) -> None:
     folder = home / "nnit" / "zoo" / "PickCube-v1"
     assert_error(nnit_zoo("verify"), "no zoo of PickCube-v1", "nnit-zoo download --task PickCube-v1")
@@ -275,7 +290,7 @@ def test_a_task_without_success_has_no_such_columns(
     assert "0.960" in shown and "success" not in shown
     assert "success" not in nnit_zoo("show", "MNIST-PCA32", "--architecture", "32-16-64-32")[1]
     assert json.loads(nnit_zoo("list", "--json")[1])[0]["splits"]["seen"]["success_at_end"] is None
-    assert "| MNIST-PCA32 | seen | 2 | 3 |  | 0.96 |" in nnit_zoo("card")[1]
+    assert "| MNIST-PCA32 | seen | 2 | 3 | 64 |  | 0.96 |" in nnit_zoo("card")[1]
     assert nnit_zoo("download", "--task", "MNIST-PCA32")[0] == 0
     for score, code in ((0.96, 0), (0.9601, 2)):  # one of 10,000 digits: what is not simulated is exact
         monkeypatch.setattr(MNISTPCA32, "evaluate", playing({64: (0, score), 16: (0, score)}))
@@ -299,6 +314,7 @@ def test_completion_knows_the_commands() -> None:
         (("show", "--architecture", "32-16-64-33"), ("did you mean", "32-16-64-32")),
         (("download", "--fodler", "x"), ("--fodler", "--folder")),
         (("verify", "--deep", "-1"), ("--deep", "-1", ">= 0")),
+        (("export", "PickCube-v1", "a.onnx"), ("is a whole zoo, which becomes a folder",)),
         (("verify", "--folder", "nowhere"), ("no zoo of PickCube-v1 in nowhere", "--folder nowhere")),
     ],
 )

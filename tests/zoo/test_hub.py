@@ -8,12 +8,18 @@ import sys
 from pathlib import Path
 from unittest.mock import Mock
 
+import httpx2
 import huggingface_hub
 import pytest
+from huggingface_hub.constants import ENDPOINT
+from huggingface_hub.errors import HfHubHTTPError
 
 from nnit_zoo import card, files
+from nnit_zoo.cli import push
+from nnit_zoo.display import Display
+from nnit_zoo.download import Download
 from nnit_zoo.errors import UserError
-from nnit_zoo.hub import Source, Target
+from nnit_zoo.hub import Source, Target, explained
 from nnit_zoo.verify import verify
 from nnit_zoo.zoo import Zoo
 
@@ -33,7 +39,16 @@ def nnit_zoo(*arguments: str, **environment: str) -> subprocess.CompletedProcess
     )
 
 
-@pytest.mark.parametrize("address", ["someone/zoo", "hf://datasets/someone/zoo"])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "someone/zoo",
+        "hf://datasets/someone/zoo",
+        "hf://datasets/someone/zoo/",
+        "datasets/someone/zoo",
+        f"{ENDPOINT}/datasets/someone/zoo",
+    ],
+)
 def test_the_hub_gives_the_bytes_that_the_ghns_give(hub, made_once: Path, tmp_path: Path, address: str) -> None:
     finished: list[int] = []
     Source(address, "PickCube-v1", revision="main").fetch(tmp_path / "zoo", finished.append)
@@ -158,6 +173,39 @@ def test_a_refused_push_says_how_to_log_in(hub) -> None:
     hub.closed = True
     with pytest.raises(UserError, match=r"(?s)refuses someone/new.*hf auth login"):
         Target("someone/new", ["PickCube-v1"])
+
+
+@pytest.mark.parametrize(
+    ("status", "advice"),
+    [(401, "hf auth login"), (404, "check the name"), (429, "run the same command again"), (503, "run the same")],
+)
+def test_what_the_hub_answers_decides_what_is_advised(status: int, advice: str) -> None:
+    request = httpx2.Request("GET", "http://127.0.0.1/")
+    error = HfHubHTTPError("no", response=httpx2.Response(status, request=request))
+    with pytest.raises(UserError, match=f"someone/zoo.*{advice}"), explained("someone/zoo"):
+        raise error
+
+
+def test_offline_the_usual_zoo_is_made_and_the_hub_not_asked(
+    hub, home: Path, made_once: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    hub.asked.clear()
+    zoo = Download("PickCube-v1", source="someone/zoo")
+    zoo.run(Display(quiet=True))
+    assert contents(zoo.folder) == contents(made_once) and not hub.asked
+    with pytest.raises(UserError, match="HF_HUB_OFFLINE"):
+        Download("PickCube-v1", tmp_path / "elsewhere", source="someone/zoo")
+
+
+def test_a_push_of_a_zoo_in_part_makes_no_data_set(hub, home: Path, tmp_path: Path) -> None:
+    Source("someone/zoo", "PickCube-v1").fetch(tmp_path / "zoo", splits=["seen"])
+    with pytest.raises(UserError, match="is missing or damaged"):
+        push("someone/new", folder=tmp_path / "zoo")
+    assert set(hub.files) == {"someone/zoo"}
+    Source("someone/zoo", "PickCube-v1").fetch(tmp_path / "zoo")
+    push("someone/new", folder=tmp_path / "zoo")  # of the task that the folder holds
+    assert "PickCube-v1/manifest.json" in hub.files["someone/new"]
 
 
 def test_a_push_to_nobody_makes_nothing(hub) -> None:

@@ -25,6 +25,7 @@ from nnit_zoo.atomic import write_atomically, write_bytes
 from nnit_zoo.errors import UserError
 from nnit_zoo.files import Entry, Manifest
 from nnit_zoo.ghn import GHN
+from nnit_zoo.hub import Source
 from nnit_zoo.materialise import materialise, write_manifest
 from nnit_zoo.policy import PolicyBatch
 from nnit_zoo.verify import verify
@@ -69,13 +70,36 @@ def test_the_index_says_how_large_a_policy_is_and_its_weights(made_once: Path) -
         assert policy.record["weight_norm"] == pytest.approx(np.linalg.norm(flat), rel=1e-7)
 
 
-def test_an_index_with_other_columns_is_told(zoo_folder: Path) -> None:
-    manifest = Manifest.read(zoo_folder)
-    pq.write_table(files.read_index(zoo_folder / files.INDEX).drop_columns("weight_norm"), zoo_folder / files.INDEX)
-    manifest.index = Entry.of((zoo_folder / files.INDEX).read_bytes())
+@pytest.mark.parametrize("message", ["has other columns than id, task,", "is not a Parquet file"])
+def test_an_index_of_something_else_is_told(zoo_folder: Path, message: str) -> None:
+    manifest, path = Manifest.read(zoo_folder), zoo_folder / files.INDEX
+    if "columns" in message:
+        pq.write_table(files.read_index(path).drop_columns("weight_norm"), path)
+    else:
+        path.write_bytes(b"garbage")
+    manifest.index = Entry.of(path.read_bytes())
     (zoo_folder / files.MANIFEST).write_bytes(manifest.to_bytes())
     (problem,) = verify(zoo_folder)
-    assert "index.parquet has other columns than id, task," in problem
+    assert f"index.parquet {message}" in problem
+    with pytest.raises(UserError, match=message):
+        Zoo.open(zoo_folder)
+    with pytest.raises(UserError, match=message):
+        Source(str(zoo_folder), "PickCube-v1").fetch(zoo_folder / "copy")
+
+
+def test_a_damaged_index_that_ships_is_told_before_it_is_copied(data_folder: Path, tmp_path: Path) -> None:
+    damaged = shutil.copytree(data_folder, tmp_path / "damaged")
+    pq.write_table(files.read_index(data_folder / files.INDEX), damaged / files.INDEX, compression="none")
+    with pytest.raises(UserError, match=r"index.parquet is not what manifest.json promises; install nnit again"):
+        materialise(damaged, tmp_path / "zoo")
+    assert not (tmp_path / "zoo").exists()
+
+
+def test_a_zoo_that_is_there_is_not_written_again(data_folder: Path, zoo_folder: Path) -> None:
+    """It may be on a disk that is full, or read-only."""
+    before = {path.name: path.stat().st_ino for path in zoo_folder.iterdir()}
+    materialise(data_folder, zoo_folder, splits=["unseen"])
+    assert {path.name: path.stat().st_ino for path in zoo_folder.iterdir()} == before
 
 
 def test_two_writers_of_a_file_with_the_same_process_number_do_not_meet(tmp_path: Path) -> None:
