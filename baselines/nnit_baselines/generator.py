@@ -57,7 +57,7 @@ class Capabilities:
     checkpoint: bool = True
     """Is trained beforehand and read from a checkpoint; otherwise `fit` takes no time and is called at every run."""
     oracle: bool = False
-    """Is fitted on the reference policies of the evaluated split: an upper bound, not a method."""
+    """Is fitted on the reference policies of the evaluated split: a yardstick, not a method."""
 
 
 @dataclass(frozen=True)

@@ -267,8 +267,10 @@ def list_names(*, as_json: Json = False) -> None:
         return
     for name, shipped in methods.items():
         checkpoints = f"checkpoint for {', '.join(shipped)}" if shipped else "no checkpoint"
-        needed = found[name].capabilities.checkpoint
-        sys.stdout.write(f"method  {name:12}  {checkpoints if needed else 'needs no training'}\n")
+        kind = found[name]
+        what = (kind.__doc__ or "").partition("\n")[0]
+        sys.stdout.write(f"method  {name:12}  {checkpoints if kind.capabilities.checkpoint else 'needs no training'}\n")
+        sys.stdout.write(f"{'':22}{what}\n")
     for name in tasks.names():
         zoo = "its zoo ships" if name in zoos else f"no zoo yet; nnit-zoo build --task {name} makes one"
         sys.stdout.write(f"task    {name:16}  {zoo}\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -21,6 +22,7 @@ from nnit_zoo.errors import UserError
 from nnit_zoo.tasks.metric import Metric
 
 NAMES = {"mean": "mean", "top": "top", "top_heldout": "held out"}
+SEPARABLE = {True: "yes", False: "no", None: "-"}
 
 
 class Incomparable(UserError):
@@ -38,9 +40,12 @@ class Difference:
     difference: Estimate
 
     @property
-    def separable(self) -> bool:
-        """Whether the difference has an interval, and it leaves out zero."""
-        return _leaves_out_zero(self.difference)
+    def separable(self) -> bool | None:
+        """Whether the difference of two methods has an interval that leaves out zero.
+
+        None for policies that were picked: their difference says nothing of the methods' others.
+        """
+        return _leaves_out_zero(self.difference) if self.statistic == "mean" else None
 
 
 def compare(
@@ -172,12 +177,17 @@ def _print(runs: Sequence[StoredRun], differences: Sequence[Difference]) -> None
         both = (f"{value * metric.scale:.1f}" for value in (each.first, each.second))
         name = NAMES[each.statistic] if each.statistic != "top" else f"top-{protocol.best}"
         change = "\n".join(each.difference.text(metric.scale, signed=True))
-        table.add_row(metric.heading, name, *both, change, "yes" if each.separable else "no")
+        table.add_row(metric.heading, name, *both, change, SEPARABLE[each.separable])
     console.print(
         f"{protocol.task}, {protocol.split}: {first} against {second}, on shared architectures and episodes\n"
     )
     console.print(table, end="\n\n")
     console.print(in_words(first, second, differences[0], protocol.metrics[0]))
+    console.print("Each interval is of 95 % by itself, so the first line is the one that decides.")
+    if any(each.separable is None for each in differences):
+        console.print("The best ones were picked: their lines speak of these policies, not of the methods.")
+    for name, run in zip((first, second), runs, strict=True):
+        console.print(f"{name}: {_place(run)}", soft_wrap=True)
 
 
 def in_words(first: str, second: str, difference: Difference, metric: Metric) -> str:
@@ -198,6 +208,12 @@ def in_words(first: str, second: str, difference: Difference, metric: Metric) ->
         )
     word, size = "below" if value.startswith("-") else "above", value.lstrip("+-")
     return f"{first} is {word} {second} in mean {metric.label} by {size}{unit} (95 % interval {interval}): separable."
+
+
+def _place(run: StoredRun) -> Path:
+    """The run's folder, seen from here if it is below."""
+    folder = run.folder.resolve()
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 def _name(run: StoredRun, runs: Sequence[StoredRun]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from typing import Literal
 
 import pyarrow.compute as pc
@@ -27,6 +28,8 @@ ROBOT_TASKS = ("PickCube-v1", "PushCube-v1", "StackCubeEasy-v1")
 MNIST = "MNIST-PCA32"
 METHODS = {"NNiT": "nnit", "D2NWG": "d2nwg-packed", "SANE": "sane-2024"}
 """The paper's name of a method -> ours."""
+CONTROLS = ("nearest", "crop")
+"""What needs no training and is not in the paper: how far one gets with stored policies, padded or cut to size."""
 SUCCESS, RETURN = "success_at_end", "return"
 
 # NNiT table 2: (return, ±, success %) of PickCube, PushCube and StackCubeEasy.
@@ -54,6 +57,10 @@ FULL_DISTRIBUTION = {
 }
 # NNiT appendix "Validation on the MNIST Benchmark": mean accuracy %, and how many of 80 networks are above 80 %.
 MNIST_RESULTS = (96.1, 80)
+TOLERANT = (
+    "here: of hypernetworks that had weight noise while they learned, so they may bear more of any generator's errors "
+    "than the paper's (docs/deviations.md)"
+)
 PUSH_SCALE = (
     "PushCube-v1, here: rewards as ManiSkill has them since 3.0.0b21, out of 4; out of 3, as they were and as the "
     "paper's may be, our expert's return is higher by 0.6"
@@ -118,8 +125,8 @@ def reproduce(*, table: Name = "main", folders: Folders = FOLDERS, as_json: Json
         shown = RichTable(box=SIMPLE_HEAD, padding=(0, 0), show_edge=False)
         for number, heading in enumerate(("", "", *each.columns)):
             shown.add_column(heading, justify="left" if number < 2 else "right", no_wrap=True)
-        for row in each.rows:
-            label = "" if row.source == "here" else row.label
+        for before, row in zip([None, *each.rows], each.rows, strict=False):
+            label = "" if before and before.label == row.label else row.label
             shown.add_row(label, row.source, *map(_text, row.cells))
             if row.source == "here":
                 shown.add_section()
@@ -127,7 +134,7 @@ def reproduce(*, table: Name = "main", folders: Folders = FOLDERS, as_json: Json
         console.print(shown)
         console.print()
     for line in dict.fromkeys(line for each in made for line in each.notes):
-        console.print(line, soft_wrap=True)
+        console.print(line, soft_wrap=line.startswith("missing"))  # a command can be copied
 
 
 def _text(cell: Number | None) -> str:
@@ -140,8 +147,9 @@ def markdown(table: Table) -> str:
     lines.append("|---" * 2 + "|---:" * len(table.columns) + "|")
     for row in table.rows:
         cells = " | ".join(_text(cell).replace("\n", " ") for cell in row.cells)
-        lines.append(f"| {row.label if row.source == 'paper' else ''} | {row.source} | {cells} |")
-    return "\n".join([*lines, ""])
+        lines.append(f"| {row.label} | {row.source} | {cells} |")
+    notes = [f"- {note}" for note in dict.fromkeys(table.notes)]
+    return "\n".join([*lines, "", *notes, ""] if notes else [*lines, ""])
 
 
 Latest = Mapping[tuple[str, str, str], StoredRun]
@@ -171,6 +179,10 @@ def full_distribution(runs: Latest) -> list[Table]:
         table.rows.append(Row(label, "paper", tuple(Number(value) for value in paper)))
         cells = _ours(table, runs, name, "unseen", statistic)[1::2]
         table.rows.append(Row(label, "here", cells))
+    for statistic, name in product(names, CONTROLS):
+        cells = _ours(table, runs, name, "unseen", statistic)[1::2]
+        table.rows.append(Row(f"{names[statistic]}, {name}", "here", cells))
+    table.notes.append(f"{', '.join(CONTROLS)}: not in the paper; stored policies, padded or cut to size, no training")
     return [table]
 
 
@@ -245,10 +257,11 @@ def _tell_scale(table: Table) -> None:
 
 def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> StoredRun | None:
     """The stored run of a method of the paper; without one, notes in the table what makes it."""
-    run = runs.get((task, split, METHODS[name]))
+    method = METHODS.get(name, name)
+    run = runs.get((task, split, method))
     if run is None:
-        there = METHODS[name] in _methods()
-        make = f"missing: {results.command(METHODS[name], task, split)}"
+        there = method in _methods()
+        make = f"missing: {results.command(method, task, split)}"
         table.notes.append(make if there else f"missing: {name} is not in this version of nnit")
     elif run.summary is None:
         table.notes.append(f"unsupported: {name} on {task}, {split}: {run.record.error}")
@@ -258,10 +271,20 @@ def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> Store
         table.notes.append(f"with {', '.join(run.given)}: {name} on {task}, {split}")
     if run and run.is_shipped:
         table.notes.append(f"shipped, not run here: {name} on {task}, {split}")
-    if run and name == "NNiT" and (preset := run.record.method.training.get("preset")) != "paper":
+    if run and name == "NNiT" and (preset := _preset(run)) != "paper":
         settings = f"preset {preset}" if preset else "settings of its own"
         table.notes.append(f"NNiT, here: {settings}, not the paper's (docs/nnit.md)")
+    if run and task in ROBOT_TASKS:
+        table.notes.append(TOLERANT)
     return run
+
+
+def _preset(run: StoredRun) -> str | None:
+    """The preset of NNiT that a run's settings are, whatever their number of steps; None if they are of no preset."""
+    from nnit_baselines.nnit.config import NNiTConfig, preset_name  # noqa: PLC0415  imports torch
+
+    settings = run.record.method.config.get("settings")
+    return preset_name(NNiTConfig.model_validate(settings)) if settings else None
 
 
 def _methods() -> Sequence[str]:

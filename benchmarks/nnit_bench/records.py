@@ -73,7 +73,7 @@ class Method(_Strict):
     checkpoint_sha256: str | None
     """Of the checkpoint's model.safetensors; null for a generator that is fitted at every run."""
     oracle: bool = False
-    """Fitted on the reference policies of the evaluated split: an upper bound, not a method."""
+    """Fitted on the reference policies of the evaluated split: a yardstick, not a method."""
 
     @property
     def label(self) -> str:

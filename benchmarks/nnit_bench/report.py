@@ -116,10 +116,11 @@ def _markdown(groups: Sequence[Group], figures: dict[str, Figure]) -> str:
             f"Headline: {metric.heading}, with 95 % intervals. `tied with`: cannot be "
             "told apart from these. `nearest known`: median distance (relative L2) to the nearest policy that a "
             "known seed has for the architecture; in brackets as a multiple of that of held-out seeds. "
+            "`copies`: policies that are stored ones, if need be cut or padded to size. "
             "`shipped`: run by the project, not here.\n"
         )
         best = f"top-{max(run.record.protocol.best for run in group)}"
-        heading = ["method", "mean", best, "held out", "worst architecture", "tied with", "nearest known"]
+        heading = ["method", "mean", best, "held out", "worst architecture", "tied with", "nearest known", "copies"]
         parts.append("| " + " | ".join(heading) + " |\n|---|" + "---:|" * (len(heading) - 1))
         ties = _ties(group)
         parts += [_row(run, group, metric, ties[run.folder]) for run in group]
@@ -147,10 +148,10 @@ def _ties(group: Group) -> dict[Path, list[str]]:
 
 def _row(run: StoredRun, group: Group, metric: Metric, ties: Sequence[str]) -> str:
     record = run.record
-    marks = [*run.given, "upper bound" * record.method.oracle, "shipped" * run.is_shipped]
+    marks = [*run.given, "yardstick" * record.method.oracle, "shipped" * run.is_shipped]
     name = ", ".join([record.method.label + _size(run, group), *filter(None, marks)])
     if run.summary is None:
-        return f"| {name} | {record.status}: {record.error} |" + " |" * 5
+        return f"| {name} | {record.status}: {record.error} |" + " |" * 6
     numbers = run.summary.estimates[metric.column]
     cells = [_cell(numbers.get(name), metric) for name in ("mean", "top", "top_heldout", "worst")]
     if run.summary.worst:
@@ -158,7 +159,8 @@ def _row(run: StoredRun, group: Group, metric: Metric, ties: Sequence[str]) -> s
     same = record.novelty and record.novelty.same_architecture
     ratio = "" if not same or same.ratio is None else f" ({same.ratio:.2f})"
     distance = f"{same.median:.1%}{ratio}" if same else "-"
-    return "| " + " | ".join([name, *cells, ", ".join(ties), distance]) + " |"
+    copies = f"{record.novelty.copies} of {record.protocol.size}" if record.novelty else "-"
+    return "| " + " | ".join([name, *cells, ", ".join(ties), distance, copies]) + " |"
 
 
 def _size(run: StoredRun, group: Group) -> str:

@@ -155,8 +155,9 @@ def set_sampling_steps(name: str, generator: Generator, steps: int) -> None:
 def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execution, stage: Stage) -> Outcome:
     """Sample, score and record one method, or find that it has been done.
 
-    An interrupted run leaves a record with status `started` and its finished work; the same call goes on from there.
-    Raises UserError if the method or the task cannot, after recording that.
+    An interrupted run leaves a record with status `started` and its finished work; the same call goes on from there. A
+    run that is to be repeated is replaced once its repetition is finished. Raises UserError if the method or the task
+    cannot, after recording that.
     """
     sha256 = sha256_of(zoo.folder / MANIFEST)
     identity = Identity(
@@ -166,21 +167,27 @@ def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execu
         code_sha256=entry.code.sha256,
         packages=numeric_packages() | _gpu(),
     )
-    folder = identity.folder(execution.output)
-    if earlier := _earlier(folder, execution.overwrite):
+    place = identity.folder(execution.output)
+    if execution.overwrite != "always" and (earlier := _earlier(place, execution.overwrite)):
         return earlier
+    folder = place if execution.overwrite != "always" else place.with_name(f".{place.name}")
     seen = zoo.index.filter(pc.equal(zoo.index["split"], "seen"))
     version = ZooVersion(sha256=sha256, policies=len(seen), seeds=len(pc.unique(seen["ghn_seed"])))
     record = _begun(folder) or RunRecord.start(identity, version, entry.code)
     record.write(folder)
     if entry.unsupported:
-        return Outcome(record.stop(folder, "unsupported", entry.unsupported), folder, reused=False, zeroed={})
-    try:
-        record = _carry_out(record, folder, task, zoo, entry, execution, stage)
-    except Exception as error:
-        record.stop(folder, "failed", str(error) or type(error).__name__)
-        raise
-    return Outcome(record, folder, reused=False, zeroed=zeroed(records.read_episodes(folder)))
+        record, counts = record.stop(folder, "unsupported", entry.unsupported), {}
+    else:
+        try:
+            record = _carry_out(record, folder, task, zoo, entry, execution, stage)
+        except Exception as error:
+            record.stop(folder, "failed", str(error) or type(error).__name__)
+            raise
+        counts = zeroed(records.read_episodes(folder))
+    if folder != place:
+        shutil.rmtree(place, ignore_errors=True)
+        folder.rename(place)
+    return Outcome(record, place, reused=False, zeroed=counts)
 
 
 def _gpu() -> dict[str, str]:
@@ -191,9 +198,6 @@ def _gpu() -> dict[str, str]:
 def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:
     """The outcome that is there already, if it stays; raises UserError for an unfinished one that must stay."""
     if not (folder / records.RECORD).is_file():
-        return None
-    if overwrite == "always":
-        shutil.rmtree(folder)
         return None
     record = RunRecord.read(folder)
     if record.status in ("success", "unsupported"):

@@ -51,7 +51,8 @@ def show(results: Results) -> None:
         console.print(_novelty(new), end="\n\n")
         console.print(
             "Median distance to the nearest known policy, in brackets as a multiple of that of held-out seeds. "
-            "Weights: relative L2. Actions: root mean square on 2,000 states. Copies: within 0.1 % of a known policy."
+            "Weights: relative L2. Actions: root mean square on 2,000 states; errors count there as well. "
+            "Copies: within 0.1 % of a known policy."
         )
 
 
@@ -134,7 +135,7 @@ def _remarks(console: Console, outcome: Outcome) -> None:
     if record.error:
         console.print(f"{name}: {record.error}")
     if record.method.oracle and record.results:
-        console.print(f"{name}: an upper bound, for it was given the zoo's policies of these very architectures")
+        console.print(f"{name}: a yardstick, for it was given the zoo's policies of these very architectures")
     for reason, count in outcome.zeroed.items():
         console.print(f"{name}: {count} policies scored 0: {reason}")
     joint = record.results and record.results.joint

@@ -80,6 +80,5 @@ def build(
     for name in stages:
         getattr(builder, name)()
     if as_json:
-        print_json(
-            {"task": task, "stages": stages, "seeds": seeds, "work": str(builder.work), "folder": str(builder.data)}
-        )
+        where = {"work": str(builder.work), "folder": str(builder.data)}
+        print_json({"task": task, "stages": stages, "seeds": seeds, **where})

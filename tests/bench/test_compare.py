@@ -47,7 +47,8 @@ def test_a_difference_is_seen_through_what_both_share(store: Store, protocol: Pr
 def test_no_difference_is_not_seen(store: Store, protocol: Protocol) -> None:
     runs = [store(name, protocol, outcomes(0.2, seed)) for name, seed in (("one", 1), ("two", 2))]
     mean = compare.differ(*runs)[0]
-    assert not mean.separable and mean.difference.low < 0 < mean.difference.high
+    assert mean.separable is False and mean.difference.low < 0 < mean.difference.high
+    assert {each.separable for each in compare.differ(*runs) if each.statistic != "mean"} == {None}
     assert "cannot be told apart" in compare.in_words("one", "two", mean, protocol.metrics[0])
 
 

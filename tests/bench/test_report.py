@@ -71,7 +71,7 @@ def test_every_number_stands_in_its_column(
     record.write(run.folder)
     monkeypatch.setattr(StoredRun, "summary", found)
     report(folders=(tmp_path,), output=tmp_path / "report")
-    row = "| nnit | 10.0 | 20.0 | 30.0 | 40.0 16-16-16-32 |  | 50.0% (1.50) |"
+    row = "| nnit | 10.0 | 20.0 | 30.0 | 40.0 16-16-16-32 |  | 50.0% (1.50) | 8 of 80 |"
     assert row in (tmp_path / "report" / "report.md").read_text().splitlines()
 
 
@@ -153,7 +153,7 @@ def test_ties_are_told_for_every_pair_that_can_be_compared(store: Store, pick: P
     store("random", another, outcomes(0.0, 10))
     report(folders=(tmp_path,), output=tmp_path / "report")
     rows = [line.split(" | ") for line in (tmp_path / "report" / "report.md").read_text().splitlines()]
-    ties = {row[0].removeprefix("| ").split(" (")[0]: row[5] for row in rows if len(row) == 7}
+    ties = {row[0].removeprefix("| ").split(" (")[0]: row[5] for row in rows if len(row) == 8}
     assert "crop" in ties["nnit"] and "nnit" in ties["crop"] and ties["ghn-oracle"] == ""
     assert ties["random"] == ""
 
@@ -226,7 +226,8 @@ def test_report_has_every_method_and_its_figures(
     of_unseen = lines[: lines.index("## PickCube-v1, joint")]
     rows = [line for line in of_unseen if line.startswith(("| nnit", "| crop", "| random"))]
     assert [row.split(" | ")[5] for row in rows] == ["nnit", "crop", ""]
-    assert rows[2].startswith("| random") and rows[2].endswith("| 2.0% (0.02) |")
+    assert rows[2].startswith("| random") and rows[2].endswith("| 2.0% (0.02) | 0 of 80 |")
+    assert "- NNiT, here: settings of its own, not the paper's (docs/nnit.md)" in lines
     assert any(line.startswith("| NNiT, unseen | paper | 38.70 ±0.36 | 99") for line in lines)
 
     values = list(csv.DictReader((output / "report.csv").open()))
@@ -270,6 +271,8 @@ def test_our_row_stands_under_the_papers(
     worst = run.record.results.estimates["success_at_end"]["worst"]
     cells = {row.label: row.cells for row in full.rows if row.source == "here"}
     assert cells["worst arch., NNiT"][0] == paper.Number.of(worst, 100)
+    assert cells["mean of 80, nearest"] == (None, None, None)
+    assert any(note.startswith("nearest, crop: not in the paper") for note in full.notes)
 
     paper.reproduce(table="main", folders=folders)
     out = capsys.readouterr().out

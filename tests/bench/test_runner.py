@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -181,6 +182,20 @@ def test_an_interrupted_run_keeps_its_work_and_is_finished(
     record = run().record
     assert (record.status, record.resumed, record.started) == ("success", True, begun.started)
     assert sorted(path.name for path in folder.iterdir()) == ["episodes.parquet", "policies.parquet", "run.json"]
+
+
+def test_a_finished_run_stays_until_its_repetition_is_finished(
+    run: Run, task: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = run()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(task, "evaluate", Mock(side_effect=KeyboardInterrupt))
+        run(overwrite="always")
+    assert run().reused and run().record == first.record
+    again = run(overwrite="always")
+    assert again.folder == first.folder and not again.reused
+    assert RunRecord.read(first.folder) == again.record
+    assert [path.name for path in first.folder.parent.iterdir()] == [first.folder.name]
 
 
 def test_a_failed_run_says_why(run: Run, generator: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ class Stored(Generator):
 class GHNOracle(Stored):
     """Control `ghn-oracle`: what the zoo's own GHNs give for exactly the wanted architecture.
 
-    An upper bound, since it has the zoo's generator: it keeps the reference policies of the evaluated split.
+    A yardstick, since it has the zoo's generator: it keeps the reference policies of the evaluated split.
     """
 
     capabilities = Capabilities(checkpoint=False, oracle=True)
@@ -69,19 +69,19 @@ class Noise(Stored):
 
 
 class Noise003(Noise):
-    """Control `noise-0.03`."""
+    """Control `noise-0.03`: stored policies with noise of 3 % of each layer's norm."""
 
     sigma = 0.03
 
 
 class Noise006(Noise):
-    """Control `noise-0.06`."""
+    """Control `noise-0.06`: stored policies with noise of 6 % of each layer's norm."""
 
     sigma = 0.06
 
 
 class Noise01(Noise):
-    """Control `noise-0.1`."""
+    """Control `noise-0.1`: stored policies with noise of 10 % of each layer's norm."""
 
     sigma = 0.1
 
