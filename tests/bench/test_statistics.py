@@ -1,11 +1,17 @@
 """The intervals: what they hold, and that they agree with the textbook where there is one."""
 
+import runpy
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.stats
 
 from nnit_bench import statistics
 from nnit_bench.statistics import by_cluster, estimate, mean
+
+SIMULATION = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "interval_coverage.py"))
 
 
 def test_standard_error_of_independent_policies_is_the_textbooks() -> None:
@@ -50,55 +56,18 @@ def test_variance_is_that_of_the_two_way_layout() -> None:
     assert np.mean(found) == pytest.approx(truth, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("architecture", "policy", "episode", "level", "least", "most"),
-    [
-        pytest.param(0, 1, 0.3, 1, 0.93, 0.97, id="policies differ"),
-        pytest.param(0.5, 1, 0.3, 1, 0.93, 0.97, id="both differ"),
-        pytest.param(0, 0.3, 1, 1, 0.93, 0.97, id="hard and easy episodes"),
-        pytest.param(1, 0.5, 0.3, 1, 0.93, 0.97, id="architectures differ"),
-        pytest.param(0, 0, 0, 1, 0.93, 1, id="all alike"),
-        pytest.param(0.3, 0.5, 0.5, 2.5, 0.92, 1, id="98 % succeed"),
-    ],
-)
-def test_interval_holds_the_truth(
-    architecture: float,
-    policy: float,
-    episode: float,
-    level: float,
-    least: float,
-    most: float,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Coverage of 95 % intervals on successes of 8 architectures x 10 policies x 50 shared episodes.
-
-    Where little differs, the room for starts that nobody drew makes it more than 95 %.
-    """
+@pytest.mark.parametrize("scenario", SIMULATION["SCENARIOS"], ids=lambda scenario: scenario.label)
+def test_interval_holds_the_truth(scenario: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of nearly perfect scores more often than in 95 %: they have room for starts that nobody drew."""
     monkeypatch.setattr(statistics, "REPLICATES", 500)
-    rng = np.random.default_rng(0)
-    truth = scipy.stats.norm.cdf(level / np.sqrt(1 + architecture**2 + policy**2 + episode**2))
-    clusters = np.repeat(np.arange(8), 10)
-    held, runs = 0, 400
-    for _ in range(runs):
-        skill = np.repeat(rng.normal(0, architecture, 8), 10) + rng.normal(0, policy, 80)
-        success = level + skill[:, None] + rng.normal(0, episode, 50) + rng.normal(size=(80, 50)) > 0
-        interval = mean(success.astype(float), clusters, rng, bounds=(0, 1))
-        held += interval.low <= truth <= interval.high
-    assert least <= held / runs <= most
-
-
-@pytest.mark.parametrize("share", [0.01, 0.02, 0.04, 0.08])
-def test_interval_allows_for_starts_that_all_policies_fail(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such starts may be too rare to be drawn, and yet decide by how much nearly perfect policies miss perfection."""
-    monkeypatch.setattr(statistics, "REPLICATES", 300)
-    rng = np.random.default_rng(0)
-    held, runs = 0, 300
-    for _ in range(runs):
-        rate = np.where(rng.random(50) < share, 0.04, 0.998)
-        success = (rng.random((80, 50)) < rate).astype(float)
-        interval = mean(success, np.repeat(np.arange(8), 10), rng, bounds=(0, 1))
-        held += interval.low <= share * 0.04 + (1 - share) * 0.998 <= interval.high
-    assert held / runs >= 0.94
+    runs = 300
+    held = 0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        values, clusters = scenario.run(rng)
+        interval = mean(values, clusters, rng, bounds=(0, 1))
+        held += interval.low <= scenario.truth <= interval.high
+    assert 0.92 <= held / runs <= (1 if scenario.truth > 0.8 else 0.98)
 
 
 def test_a_stray_failure_does_not_make_a_score_surer() -> None:
