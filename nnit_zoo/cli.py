@@ -118,7 +118,7 @@ def download(
         task: Name of the task.
         split: Only the shards with policies of these splits; repeat the option or use commas.
         source: A data set of the Hub (owner/name or hf://datasets/owner/name), or a folder. With HF_HUB_OFFLINE, a
-            data set is not asked, and the zoo is made, with the same bytes.
+            data set is not asked, and the zoo in the usual folder is made, with the same bytes.
         revision: Branch, tag or commit of the data set.
         folder: Where to write, instead of the cache of huggingface_hub.
         dry_run: Only say what would be written.

@@ -49,11 +49,12 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.console import Console  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    for number, column in enumerate(columns):
-        texts = [column, *(row[number] for row in rows)]
-        short = all(len(text) <= 20 and " " not in text for text in texts)  # on a narrow screen, others break first
-        table.add_column(column, overflow="fold", no_wrap=short)
+    console, table = Console(), Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    texts = [[column, *(row[number] for row in rows)] for number, column in enumerate(columns)]
+    whole = [max(map(len, each)) for each in texts if not any(" " in text for text in each)]
+    roomy = sum(whole) + 8 * (len(columns) - len(whole)) + 2 * len(columns) <= console.width
+    for each in texts:  # on a narrow screen, columns of several words break first
+        table.add_column(each[0], overflow="fold", no_wrap=roomy and not any(" " in text for text in each))
     for row in rows:
         table.add_row(*row)
-    Console().print(table)
+    console.print(table)

@@ -36,8 +36,8 @@ class Download:
             held = files.Manifest.read(self.folder).task
         if held != task:
             raise UserError(f"{self.folder} holds the zoo of {held}; choose another folder for that of {task}")
-        if source and not revision and folder is None and is_offline_mode() and not Path(source).is_dir():
-            source = None
+        if source and not (revision or folder or source.startswith(("/", ".", "~")) or Path(source).is_dir()):
+            source = None if is_offline_mode() else source
         self._verb = "fetching" if source else "making"
         self._index: pa.Table
         self._bring: Callable[[Path, Progress, Collection[str]], None]

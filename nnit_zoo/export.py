@@ -32,10 +32,10 @@ def export(zoo: Zoo, name: str, output: Path) -> None:
     _, *parts = name.split("/")
     if len(parts) == 1:
         check_known(parts)
+        batch = zoo.batch(parts[0])
         ids = zoo.index.filter(pc.field("architecture") == parts[0])["id"].to_pylist()
         if output.suffix != ".safetensors":
             raise UserError(f"{name} is an architecture: export it as .safetensors, or one of its policies, {ids[0]}")
-        batch = zoo.batch(parts[0])
         tensors = {f"layers.{depth}": layer for depth, layer in enumerate(batch.layers)}
         content = safetensors.torch.save(tensors, {"nnit": json.dumps({"policies": ids})})
     else:

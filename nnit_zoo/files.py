@@ -34,6 +34,7 @@ GHNS = "ghns.safetensors"
 SELECTION = "selection.parquet"
 CANDIDATE_EPISODES = "scores.parquet"
 HELDOUT_SEEDS_FROM = 128
+_ANEW = "download the zoo anew, or if it is nnit's own, install nnit again"
 INDEX_SCHEMA = pa.schema(
     [
         ("id", pa.string()),
@@ -191,8 +192,10 @@ def read_index(path: Path | io.BytesIO, architecture: str | None = None) -> pa.T
     name = path if isinstance(path, Path) else INDEX
     try:
         table = pq.ParquetFile(path).read()
-    except pa.ArrowException:
-        raise UserError(f"{name} is not a Parquet file, so no index of a zoo") from None
+    except (pa.ArrowException, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise UserError(f"{name} is not a Parquet file, so no index of a zoo; {_ANEW}") from None
     if not table.schema.equals(INDEX_SCHEMA):
-        raise UserError(f"{name} has other columns than {', '.join(INDEX_SCHEMA.names)}")
+        raise UserError(f"{name} has other columns than {', '.join(INDEX_SCHEMA.names)}; {_ANEW}")
     return table if architecture is None else table.filter(pc.equal(table["architecture"], architecture))

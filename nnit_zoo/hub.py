@@ -24,6 +24,8 @@ from nnit_zoo.files import INDEX, MANIFEST, Entry, Manifest, Progress
 _CONNECTIONS = 8
 _PREFIXES = (f"{ENDPOINT}/datasets/", "hf://datasets/", "hf://", "datasets/")
 """What may precede owner/name in the address of a data set."""
+_PASSING = (408, 409, 412, 429, 500, 502, 503, 504)
+"""Statuses of a Hub that may answer otherwise the next time; 412: somebody else has pushed meanwhile."""
 
 
 class Source:
@@ -151,6 +153,7 @@ def explained(address: str) -> Iterator[None]:
     except HfHubHTTPError as error:
         if error.response.status_code in (401, 403, 404):  # what is private seems not to be there
             raise UserError(f"the Hub refuses {address}: {error}; check the name, or hf auth login") from None
-        raise UserError(f"the Hub cannot serve {address} now: {error}; run the same command again") from None
+        again = "; run the same command again" if error.response.status_code in _PASSING else ""
+        raise UserError(f"the Hub cannot serve {address}: {error}{again}") from None
     except (httpx2.HTTPError, ConnectionError, TimeoutError, RuntimeError) as error:  # the last three from Xet
         raise UserError(f"the connection to {address} failed ({error}); run the same command again") from None

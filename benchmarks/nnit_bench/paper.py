@@ -13,6 +13,7 @@ from itertools import product
 from typing import Literal
 
 import pyarrow.compute as pc
+from pydantic import ValidationError
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
@@ -281,10 +282,15 @@ def _find(table: Table, runs: Latest, task: str, split: str, name: str) -> Store
 
 def _preset(run: StoredRun) -> str | None:
     """The preset of NNiT that a run's settings are, whatever their number of steps; None if they are of no preset."""
+    method = run.record.method
+    if preset := method.training.get("preset"):
+        return str(preset)
     from nnit_baselines.nnit.config import NNiTConfig, preset_name  # noqa: PLC0415  imports torch
 
-    settings = run.record.method.config.get("settings")
-    return preset_name(NNiTConfig.model_validate(settings)) if settings else None
+    try:
+        return preset_name(NNiTConfig.model_validate(method.config["settings"]))
+    except (KeyError, ValidationError):  # of another version, or not of ours
+        return None
 
 
 def _methods() -> Sequence[str]:

@@ -69,7 +69,7 @@ class Method(_Strict):
     training: dict[str, Any]
     """Facts about its training, such as seed, seconds and machine; empty for a method that is not trained."""
     parameters: int | None
-    """Numbers in its checkpoint."""
+    """Numbers in its checkpoint, scales of quantised ones among them."""
     checkpoint_sha256: str | None
     """Of the checkpoint's model.safetensors; null for a generator that is fitted at every run."""
     oracle: bool = False

@@ -7,7 +7,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +36,7 @@ from nnit_zoo.zoo import Zoo
 
 Stage = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
 """Shows a stage of work: called with its name and size, gives a context that takes the number of newly done items."""
+FINISHED = ("success", "unsupported")
 UNITS = "units"
 """Folder in a run's folder that keeps finished work until the run is finished."""
 
@@ -167,27 +168,34 @@ def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execu
         code_sha256=entry.code.sha256,
         packages=numeric_packages() | _gpu(),
     )
-    place = identity.folder(execution.output)
-    if execution.overwrite != "always" and (earlier := _earlier(place, execution.overwrite)):
+    folder = identity.folder(execution.output)
+    kept = execution.overwrite == "always" and _cleared(folder)
+    if execution.overwrite != "always" and (earlier := _earlier(folder, execution.overwrite)):
         return earlier
-    folder = place if execution.overwrite != "always" else place.with_name(f".{place.name}")
     seen = zoo.index.filter(pc.equal(zoo.index["split"], "seen"))
     version = ZooVersion(sha256=sha256, policies=len(seen), seeds=len(pc.unique(seen["ghn_seed"])))
-    record = _begun(folder) or RunRecord.start(identity, version, entry.code)
-    record.write(folder)
+    record = (None if kept else _begun(folder)) or RunRecord.start(identity, version, entry.code)
+    if not kept:
+        record.write(folder)
     if entry.unsupported:
-        record, counts = record.stop(folder, "unsupported", entry.unsupported), {}
-    else:
-        try:
-            record = _carry_out(record, folder, task, zoo, entry, execution, stage)
-        except Exception as error:
+        return Outcome(record.stop(folder, "unsupported", entry.unsupported), folder, reused=False, zeroed={})
+    try:
+        record = _carry_out(record, folder, task, zoo, entry, execution, stage)
+    except Exception as error:
+        if not kept:
             record.stop(folder, "failed", str(error) or type(error).__name__)
-            raise
-        counts = zeroed(records.read_episodes(folder))
-    if folder != place:
-        shutil.rmtree(place, ignore_errors=True)
-        folder.rename(place)
-    return Outcome(record, place, reused=False, zeroed=counts)
+        raise
+    return Outcome(record, folder, reused=False, zeroed=zeroed(records.read_episodes(folder)))
+
+
+def _cleared(folder: Path) -> bool:
+    """Whether a finished run is there, which stays until it has been repeated; what else is there goes."""
+    with suppress(UserError):  # no record, or a damaged one
+        if RunRecord.read(folder).status in FINISHED:
+            shutil.rmtree(folder / UNITS, ignore_errors=True)
+            return True
+    shutil.rmtree(folder, ignore_errors=True)
+    return False
 
 
 def _gpu() -> dict[str, str]:
@@ -200,7 +208,7 @@ def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:
     if not (folder / records.RECORD).is_file():
         return None
     record = RunRecord.read(folder)
-    if record.status in ("success", "unsupported"):
+    if record.status in FINISHED:
         shutil.rmtree(folder / UNITS, ignore_errors=True)  # left by a kill at the very end
         counts = zeroed(records.read_episodes(folder)) if record.status == "success" else {}
         return Outcome(record, folder, reused=True, zeroed=counts)

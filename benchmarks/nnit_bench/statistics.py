@@ -71,9 +71,10 @@ def mean(
 
     `bounds` are the least and the largest value that there is; if there are no others, the values are successes.
     """
-    found = estimate([by_cluster(values, clusters)], rng, drawn=drawn, bounds=bounds)
-    episodes = values.shape[1]
-    if bounds is None or episodes == 1 or found.low == found.high or not np.isin(values, bounds).all():
+    table = by_cluster(values, clusters)
+    found = estimate([table], rng, drawn=drawn, bounds=bounds)
+    episodes, few = values.shape[1], drawn and len(table) < FEWEST_UNITS
+    if bounds is None or episodes == 1 or few or not np.isin(values, bounds).all():
         return found
     low, high = _missed(found.value, episodes, bounds)
     return Estimate(found.value, min(low, found.low), max(high, found.high))

@@ -188,14 +188,31 @@ def test_a_finished_run_stays_until_its_repetition_is_finished(
     run: Run, task: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = run()
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(task, "evaluate", Mock(side_effect=KeyboardInterrupt))
-        run(overwrite="always")
-    assert run().reused and run().record == first.record
+    for what, error in ((KeyboardInterrupt, KeyboardInterrupt), (OSError, OSError)):
+        with monkeypatch.context() as patch, pytest.raises(error):
+            patch.setattr(task, "evaluate", Mock(side_effect=what))
+            run(overwrite="always")
+        assert run().reused and run().record == first.record
     again = run(overwrite="always")
-    assert again.folder == first.folder and not again.reused
+    assert again.folder == first.folder and not again.reused and again.record.started > first.record.started
     assert RunRecord.read(first.folder) == again.record
     assert [path.name for path in first.folder.parent.iterdir()] == [first.folder.name]
+
+
+def test_an_unfinished_run_is_begun_anew_if_all_is_to_be_repeated(
+    run: Run, task: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*arguments: Any, store: Path, **options: Any) -> pa.Table:
+        store.mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(task, "evaluate", interrupt)
+        run(overwrite="always")
+    with pytest.raises(UserError, match="has not finished"):
+        run(overwrite="never")
+    record = run().record  # which goes on
+    assert record.resumed and record.status == "success"
 
 
 def test_a_failed_run_says_why(run: Run, generator: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

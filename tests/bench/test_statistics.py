@@ -79,6 +79,13 @@ def test_a_stray_failure_does_not_make_a_score_surer() -> None:
     assert second.low < first.low and second.high <= 1
 
 
+def test_a_policy_that_always_fails_leaves_room_for_starts_that_differ() -> None:
+    values = np.ones((10, 50))
+    values[3] = 0
+    ours = mean(values, None, np.random.default_rng(0), drawn=False, bounds=(0, 1))
+    assert ours.low < ours.value == 0.9 < ours.high
+
+
 def test_shares_of_many_digits_have_no_room_for_missed_blocks() -> None:
     """100 blocks of 100 test digits each: no block is all right or all wrong."""
     values = np.random.default_rng(0).binomial(100, 0.97, (80, 100)) / 100

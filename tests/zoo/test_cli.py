@@ -120,6 +120,9 @@ def test_a_table_fits_a_narrow_screen(nnit_zoo: Command, monkeypatch: pytest.Mon
     lines = nnit_zoo("show")[1].splitlines()
     assert "architectures" in lines[1] and "heldout_seed" in lines[-1] + "".join(lines[:9])
     assert max(len(line) for line in lines[:7]) <= 80 and "return" in lines[1]
+    monkeypatch.setenv("COLUMNS", "40")
+    narrow = nnit_zoo("show")[1].split("Means of")[0]
+    assert narrow.count("000") >= 4  # of 38.000: cells are folded, not cut off
 
 
 def test_download_then_verify_then_mend(nnit_zoo: Command, home: Path) -> None:

@@ -177,7 +177,7 @@ def test_a_refused_push_says_how_to_log_in(hub) -> None:
 
 @pytest.mark.parametrize(
     ("status", "advice"),
-    [(401, "hf auth login"), (404, "check the name"), (429, "run the same command again"), (503, "run the same")],
+    [(401, "hf auth login"), (404, "check the name"), (503, "run the same command again"), (413, "no$")],
 )
 def test_what_the_hub_answers_decides_what_is_advised(status: int, advice: str) -> None:
     request = httpx2.Request("GET", "http://127.0.0.1/")
@@ -196,6 +196,8 @@ def test_offline_the_usual_zoo_is_made_and_the_hub_not_asked(
     assert contents(zoo.folder) == contents(made_once) and not hub.asked
     with pytest.raises(UserError, match="HF_HUB_OFFLINE"):
         Download("PickCube-v1", tmp_path / "elsewhere", source="someone/zoo")
+    with pytest.raises(UserError, match=r"no folder \./typo"):
+        Download("PickCube-v1", source="./typo")
 
 
 def test_a_push_of_a_zoo_in_part_makes_no_data_set(hub, home: Path, tmp_path: Path) -> None:
