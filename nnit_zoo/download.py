@@ -36,8 +36,10 @@ class Download:
             held = files.Manifest.read(self.folder).task
         if held != task:
             raise UserError(f"{self.folder} holds the zoo of {held}; choose another folder for that of {task}")
-        if source and not (revision or folder or source.startswith(("/", ".", "~")) or Path(source).is_dir()):
-            source = None if is_offline_mode() else source
+        if source and not (revision or folder) and is_offline_mode():
+            from nnit_zoo.hub import is_local  # noqa: PLC0415  most zoos come from no source
+
+            source = source if is_local(source) else None
         self._verb = "fetching" if source else "making"
         self._index: pa.Table
         self._bring: Callable[[Path, Progress, Collection[str]], None]

@@ -135,6 +135,7 @@ def fill(
 ) -> None:
     """Write the shards of these splits that `target` lacks, then the index, then, as the mark of a zoo, the manifest.
 
+    What is there already is not written again: the disk may be full, or read-only.
     `produce` gives name and content of each shard that it is asked for. `progress` is called with the number of newly
     finished shards. May be killed and run again, also by two processes at once. Raises UserError if the disk is full,
     the folder cannot be written, or, with this `advice`, a content is not what the manifest promises.
@@ -151,14 +152,13 @@ def fill(
         unwritten -= len(content)
         if progress:
             progress(1)
-    _write(target / INDEX, index, unwritten)
-    _write(target / MANIFEST, manifest.to_bytes(), unwritten)
+    for name, content in ((INDEX, index), (MANIFEST, manifest.to_bytes())):
+        if not Entry.of(content).describes(target / name):
+            _write(target / name, content, unwritten)
 
 
 def _write(path: Path, content: bytes, needed: int) -> None:
-    """Write a file of a zoo unless it is there, with advice if that fails; `needed` bytes are still to be written."""
-    if Entry.of(content).describes(path):
-        return
+    """Write a file of a zoo, with advice if that fails; `needed` is what remains to be written, in bytes."""
     try:
         write_bytes(path, content)
     except OSError as error:

@@ -39,12 +39,12 @@ class Source:
         self.address = f"{address}@{revision}" if revision else address
         self._revision = revision
         self._hub: HfFileSystem | None = None
-        if Path(address).is_dir():
+        if is_local(address):
             root = address
+            if not Path(address).is_dir():
+                raise UserError(f"no folder {address}")
             if revision:
                 raise UserError(f"{address} is a folder, and only the Hub has revisions: leave out --revision")
-        elif address.startswith(("/", ".", "~")):
-            raise UserError(f"no folder {address}")
         else:
             self._hub = HfFileSystem(skip_instance_cache=True)  # what the Hub holds may change
             prefix = next(filter(address.startswith, _PREFIXES), "")
@@ -100,6 +100,11 @@ class Source:
     @property
     def _advice(self) -> str:
         return f"{self.address} is damaged, or changed meanwhile; run the same command again, or choose a --revision"
+
+
+def is_local(address: str) -> bool:
+    """Whether an address names a folder, be it there or not, and not a data set of the Hub."""
+    return Path(address).is_dir() or address.startswith(("/", ".", "~"))
 
 
 class Target:
