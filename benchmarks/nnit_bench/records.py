@@ -31,6 +31,8 @@ from nnit_zoo.atomic import write_atomically
 from nnit_zoo.errors import UserError
 
 EPISODES, POLICIES, RECORD = "episodes.parquet", "policies.parquet", "run.json"
+FINISHED = ("success", "unsupported")
+"""The statuses of runs that have nothing left to do."""
 STORED_EPISODE_SCHEMA = pa.schema(
     [
         ("method", pa.string()),

@@ -15,7 +15,7 @@ from cyclopts import Parameter
 
 from nnit_bench import scores
 from nnit_bench.protocol import architectures, policies_per_architecture
-from nnit_bench.records import RECORD, RunRecord, read_episodes
+from nnit_bench.records import FINISHED, RECORD, RunRecord, read_episodes
 from nnit_bench.scores import Summary
 from nnit_zoo import tasks
 from nnit_zoo.errors import UserError, unknown_name
@@ -94,7 +94,7 @@ def find(folders: Iterable[Path]) -> list[StoredRun]:
         except UserError as error:
             sys.stderr.write(f"warning: left out: {error}\n")
             continue
-        if record.status in ("success", "unsupported"):
+        if record.status in FINISHED:
             found.append(StoredRun(record, path.parent))
     return sorted(found, key=lambda run: (run.record.started, str(run.folder)))
 

@@ -36,7 +36,6 @@ from nnit_zoo.zoo import Zoo
 
 Stage = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
 """Shows a stage of work: called with its name and size, gives a context that takes the number of newly done items."""
-FINISHED = ("success", "unsupported")
 UNITS = "units"
 """Folder in a run's folder that keeps finished work until the run is finished."""
 
@@ -191,7 +190,7 @@ def run(task: Task, zoo: Zoo, entry: Entry, protocol: Protocol, execution: Execu
 def _cleared(folder: Path) -> bool:
     """Whether a finished run is there, which stays until it has been repeated; what else is there goes."""
     with suppress(UserError):  # no record, or a damaged one
-        if RunRecord.read(folder).status in FINISHED:
+        if RunRecord.read(folder).status in records.FINISHED:
             shutil.rmtree(folder / UNITS, ignore_errors=True)
             return True
     shutil.rmtree(folder, ignore_errors=True)
@@ -208,7 +207,7 @@ def _earlier(folder: Path, overwrite: Overwrite) -> Outcome | None:
     if not (folder / records.RECORD).is_file():
         return None
     record = RunRecord.read(folder)
-    if record.status in FINISHED:
+    if record.status in records.FINISHED:
         shutil.rmtree(folder / UNITS, ignore_errors=True)  # left by a kill at the very end
         counts = zeroed(records.read_episodes(folder)) if record.status == "success" else {}
         return Outcome(record, folder, reused=True, zeroed=counts)
