@@ -58,16 +58,16 @@ def test_variance_is_that_of_the_two_way_layout() -> None:
 
 @pytest.mark.parametrize("scenario", SIMULATION["SCENARIOS"], ids=lambda scenario: scenario.label)
 def test_interval_holds_the_truth(scenario: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of nearly perfect scores more often than in 95 %: they have room for starts that nobody drew."""
+    """Room for starts that nobody drew makes it more than 95 %, most of all where scores are nearly perfect."""
     monkeypatch.setattr(statistics, "REPLICATES", 500)
-    runs = 300
+    runs = 400
     held = 0
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         values, clusters = scenario.run(rng)
         interval = mean(values, clusters, rng, bounds=(0, 1))
         held += interval.low <= scenario.truth <= interval.high
-    assert 0.92 <= held / runs <= (1 if scenario.truth > 0.8 else 0.98)
+    assert 0.93 <= held / runs <= (1 if scenario.truth > 0.8 else 0.98)
 
 
 def test_a_stray_failure_does_not_make_a_score_surer() -> None:
